@@ -1,0 +1,39 @@
+"""Simulated time: an integer number of picoseconds.
+
+SimPy compares times with ``==`` and ``<``; floating-point seconds would make two events that belong to one instant
+happen in an order that depends on rounding. With integer ticks, as in gem5, ties are exact and a simulation is the
+same on every machine. Seconds appear only where numbers enter and leave.
+"""
+
+from __future__ import annotations
+
+import math
+
+from simrender.errors import ScheduleError
+
+TICKS_PER_SECOND = 10**12
+"""One tick is a picosecond."""
+
+
+def to_ticks(seconds: float) -> int:
+    """Return a duration in ticks, rounded up, so that nothing ever ends before it could have.
+
+    Parameters
+    ----------
+    seconds : float
+        A duration in seconds; finite and not negative.
+
+    Raises
+    ------
+    ScheduleError
+        If the duration is negative, infinite or not a number.
+
+    """
+    if not 0.0 <= seconds < math.inf:
+        raise ScheduleError(f"a duration must be finite and not negative, got {seconds!r} s")
+    return math.ceil(seconds * TICKS_PER_SECOND)
+
+
+def to_seconds(ticks: int) -> float:
+    """Return a time or duration in ticks as seconds."""
+    return ticks / TICKS_PER_SECOND
