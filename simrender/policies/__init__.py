@@ -1,0 +1,1 @@
+"""Schedulers, one a file, and what they are allowed to do."""

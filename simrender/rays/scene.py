@@ -1,0 +1,279 @@
+"""Scenes of triangle meshes with instances.
+
+As in PBRT and in the ray queue cycling paper (section 4.1), a scene is a list of instances of *objects*; an object is
+one or more triangle *meshes*, and a mesh has one *material*. A triangle's global id counts through the instances in
+order, then through the meshes of the instance's object, then through the mesh's faces. It does not depend on how the
+scene is partitioned, which is what makes equally near hits resolve alike everywhere.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simrender.errors import SceneError
+
+F32 = NDArray[np.float32]
+I32 = NDArray[np.int32]
+
+IDENTITY = np.eye(4, dtype=np.float32)[:3]
+
+
+@dataclass(frozen=True)
+class Material:
+    """How a surface scatters light: Lambertian with some probability, else mirror-like; and what it emits.
+
+    Attributes
+    ----------
+    albedo : (r, g, b)
+        Reflectance of both lobes, 0 to 1.
+    mirror : float
+        Probability that a ray is reflected mirror-like and not diffusely, 0 to 1.
+    emission : (r, g, b)
+        Radiance emitted on both sides; any value above zero makes the meshes of this material area lights.
+
+    """
+
+    albedo: tuple[float, float, float] = (0.7, 0.7, 0.7)
+    mirror: float = 0.0
+    emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class PointLight:
+    """A light without extent.
+
+    Attributes
+    ----------
+    position : (x, y, z)
+    intensity : (r, g, b)
+        Radiant intensity in power per steradian: the irradiance at distance d is intensity / d^2.
+
+    """
+
+    position: tuple[float, float, float]
+    intensity: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Environment:
+    """Light from outside the scene, a vertical gradient: what a ray sees that hits nothing.
+
+    Attributes
+    ----------
+    zenith, horizon, ground : (r, g, b)
+        Radiance straight up, at the horizon, and straight down.
+    up : (x, y, z)
+        Unit vector towards the zenith.
+
+    """
+
+    zenith: tuple[float, float, float] = (0.35, 0.55, 0.95)
+    horizon: tuple[float, float, float] = (0.95, 0.95, 0.95)
+    ground: tuple[float, float, float] = (0.3, 0.28, 0.25)
+    up: tuple[float, float, float] = (0.0, 0.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh with one material.
+
+    Attributes
+    ----------
+    vertices : float32 array (n, 3)
+    faces : int32 array (m, 3)
+        Indices into ``vertices``.
+    material : int
+        Index into the scene's materials.
+
+    Raises
+    ------
+    SceneError
+        If the mesh is empty, has a vertex that is not finite, or a face that points outside the vertices.
+
+    """
+
+    vertices: F32
+    faces: I32
+    material: int = 0
+
+    def __post_init__(self) -> None:
+        vertices = np.ascontiguousarray(self.vertices, dtype=np.float32)
+        indices = np.asarray(self.faces)
+        if vertices.ndim != 2 or vertices.shape[1:] != (3,) or indices.ndim != 2 or indices.shape[1:] != (3,):
+            raise SceneError(f"vertices and faces are arrays of shape (n, 3), got {vertices.shape} and {indices.shape}")
+        if len(vertices) == 0 or len(indices) == 0:
+            raise SceneError("the mesh is empty: it has no triangles")
+        bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+        if len(bad):
+            where = f"the first is vertex {bad[0]}: {vertices[bad[0]].tolist()}"
+            raise SceneError(f"{len(bad)} of {len(vertices)} vertices are not finite; {where}")
+        outside = np.flatnonzero(((indices < 0) | (indices >= len(vertices))).any(axis=1))
+        if len(outside):
+            where = f"the first is face {outside[0]}: {indices[outside[0]].tolist()}"
+            raise SceneError(f"{len(outside)} faces point outside the {len(vertices)} vertices; {where}")
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", np.ascontiguousarray(indices, dtype=np.int32))
+
+
+@dataclass(frozen=True, eq=False)
+class SceneObject:
+    """One or more meshes that are placed together; the unit that a partition assigns."""
+
+    name: str
+    meshes: tuple[Mesh, ...]
+
+    @cached_property
+    def triangles(self) -> int:
+        """Number of triangles of all meshes, before instancing."""
+        return sum(len(m.faces) for m in self.meshes)
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """A scene with every instance written out in world space: what Embree, which embreex offers without instancing, gets.
+
+    Attributes
+    ----------
+    vertices : float32 array (v, 3)
+    faces : int32 array (t, 3)
+        Row i is the triangle of global id i.
+    mesh : int32 array (t,)
+        The triangle's mesh, numbered through the objects in order.
+
+    """
+
+    vertices: F32
+    faces: I32
+    mesh: I32
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Objects, their instances, materials and lights.
+
+    Attributes
+    ----------
+    objects : tuple of SceneObject
+    instance_object : int32 array (n,)
+        The object of each instance.
+    instance_transform : float32 array (n, 3, 4)
+        Object space to world space, affine.
+    materials : tuple of Material
+    points : tuple of PointLight
+    environment : Environment
+
+    Raises
+    ------
+    SceneError
+        If there is nothing to render, or an index or transform is out of order.
+
+    """
+
+    objects: tuple[SceneObject, ...]
+    instance_object: I32
+    instance_transform: F32
+    materials: tuple[Material, ...] = (Material(),)
+    points: tuple[PointLight, ...] = ()
+    environment: Environment = field(default_factory=Environment)
+
+    def __post_init__(self) -> None:
+        of = np.ascontiguousarray(self.instance_object, dtype=np.int32)
+        transform = np.ascontiguousarray(self.instance_transform, dtype=np.float32)
+        if len(of) == 0:
+            raise SceneError("the scene is empty: it has no instances")
+        if transform.shape != (len(of), 3, 4):
+            raise SceneError(f"{len(of)} instances need transforms of shape ({len(of)}, 3, 4), got {transform.shape}")
+        if of.min() < 0 or of.max() >= len(self.objects):
+            raise SceneError(f"an instance points to object {of.max()}, but there are {len(self.objects)} objects")
+        if not np.isfinite(transform).all():
+            raise SceneError("an instance has a transform that is not finite")
+        for thing in self.objects:
+            for mesh in thing.meshes:
+                if not 0 <= mesh.material < len(self.materials):
+                    raise SceneError(f"object {thing.name!r} uses material {mesh.material} of {len(self.materials)}")
+        object.__setattr__(self, "instance_object", of)
+        object.__setattr__(self, "instance_transform", transform)
+
+    @cached_property
+    def instances_of(self) -> NDArray[np.int64]:
+        """Number of instances of each object, int64 (objects,)."""
+        return np.bincount(self.instance_object, minlength=len(self.objects))
+
+    @cached_property
+    def meshes(self) -> tuple[Mesh, ...]:
+        """All meshes, numbered through the objects in order."""
+        return tuple(mesh for thing in self.objects for mesh in thing.meshes)
+
+    @cached_property
+    def mesh_material(self) -> I32:
+        """Material of each mesh, int32 (meshes,)."""
+        return np.array([mesh.material for mesh in self.meshes], dtype=np.int32)
+
+    @cached_property
+    def unique_triangles(self) -> int:
+        """Number of triangles before instancing."""
+        return sum(thing.triangles for thing in self.objects)
+
+    @cached_property
+    def instanced_triangles(self) -> int:
+        """Number of triangles with every instance counted."""
+        return int(sum(thing.triangles * int(n) for thing, n in zip(self.objects, self.instances_of, strict=True)))
+
+    @cached_property
+    def triangles(self) -> Triangles:
+        """The scene written out in world space, computed when first asked for."""
+        vertex_count = np.array([sum(len(m.vertices) for m in o.meshes) for o in self.objects])
+        face_count = np.array([o.triangles for o in self.objects])
+        first_vertex = _starts(vertex_count[self.instance_object])
+        first_face = _starts(face_count[self.instance_object])
+        first_mesh = _starts(np.array([len(o.meshes) for o in self.objects]))
+        vertices = np.zeros((first_vertex[-1], 3), np.float32)
+        faces = np.zeros((first_face[-1], 3), np.int32)
+        mesh_of = np.zeros(first_face[-1], np.int32)
+        for index, thing in enumerate(self.objects):
+            instances = np.flatnonzero(self.instance_object == index)
+            if len(instances) == 0:
+                continue
+            shift = _starts(np.array([len(m.vertices) for m in thing.meshes]))
+            local = np.concatenate([m.vertices for m in thing.meshes])
+            corners = np.concatenate([m.faces + s for m, s in zip(thing.meshes, shift[:-1], strict=True)])
+            ids = np.repeat(np.arange(len(thing.meshes), dtype=np.int32), [len(m.faces) for m in thing.meshes])
+            matrix = self.instance_transform[instances]
+            world = np.einsum("nij,vj->nvi", matrix[:, :, :3], local) + matrix[:, None, :, 3]
+            rows = first_vertex[instances][:, None] + np.arange(len(local))
+            vertices[rows.ravel()] = world.reshape(-1, 3)
+            rows = (first_face[instances][:, None] + np.arange(len(corners))).ravel()
+            faces[rows] = (corners[None] + first_vertex[instances][:, None, None]).reshape(-1, 3)
+            mesh_of[rows] = np.tile(ids + first_mesh[index], len(instances))
+        return Triangles(vertices, faces, mesh_of)
+
+    @cached_property
+    def bounds(self) -> tuple[F32, F32]:
+        """Lowest and highest corner of the scene in world space."""
+        vertices = self.triangles.vertices
+        return vertices.min(axis=0), vertices.max(axis=0)
+
+    @cached_property
+    def key(self) -> str:
+        """Content hash: two scenes with the same key give the same rays."""
+        digest = hashlib.blake2b(digest_size=16)
+        for thing in self.objects:
+            digest.update(f"object {len(thing.meshes)}".encode())
+            for mesh in thing.meshes:
+                digest.update(f"mesh {mesh.vertices.shape} {mesh.faces.shape} {mesh.material}".encode())
+                digest.update(mesh.vertices)
+                digest.update(mesh.faces)
+        digest.update(self.instance_object)
+        digest.update(self.instance_transform)
+        digest.update(repr((self.materials, self.points, self.environment)).encode())
+        return digest.hexdigest()
+
+
+def _starts(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the running sum that begins with 0 and ends with the total, int64 (n + 1,)."""
+    return np.concatenate([[0], np.cumsum(counts)])
