@@ -1,1 +1,1 @@
-"""Machine cards."""
+"""Machines, one folder each with a card.yaml; found through the entry-point group ``simrender.machines``."""

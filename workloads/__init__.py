@@ -1,1 +1,1 @@
-"""Workload cards."""
+"""Scenes, one folder each with a card.yaml; found through the entry-point group ``simrender.workloads``."""

@@ -1,0 +1,87 @@
+"""How fast the network is: flows that meet nobody, rings in which everybody meets, and the solver by itself.
+
+Each asserts how many events it took or how many flows it rated, so that it tells a slower machine from more work.
+"""
+
+import math
+
+import simpy
+
+from simrender.hardware.network import Link, Network, max_min_rates
+
+GPUS = 16
+STAGES = 100
+
+
+def run(env):
+    events = 0
+    while env.peek() != math.inf:
+        env.step()
+        events += 1
+    return events
+
+
+def ring(stagger, stages=STAGES):
+    """Pass messages of different sizes around a ring, over links that differ; return events and rated flows."""
+    env = simpy.Environment()
+    links = {("out", i): Link(25e9, 1e-6) for i in range(GPUS)} | {("in", i): Link(25e9, 1e-6) for i in range(GPUS)}
+    links |= {("duplex", i): Link(40e9 * (1 + i / GPUS)) for i in range(GPUS)}
+    right = {i: (i + 1) % GPUS for i in range(GPUS)}
+    routes = {(i, j): [("out", i), ("duplex", i), ("duplex", j), ("in", j)] for i, j in right.items()}
+    net = Network(env, links, routes)
+
+    def program():
+        for stage in range(stages):
+            sizes = [1e6 * (1 + 0.05 * ((7 * i + stage) % GPUS)) for i in range(GPUS)]
+            yield env.all_of([net.transfer(i, right[i], sizes[i], start=env.now + i * stagger) for i in range(GPUS)])
+
+    env.process(program())
+    events = run(env)
+    assert net.flows_finished == GPUS * stages
+    return events, net.reratings
+
+
+def test_a_ring_whose_flows_start_together(benchmark):
+    assert benchmark(ring, 0) == (4275, 7088)
+
+
+def test_a_ring_whose_flows_start_one_after_another(benchmark):
+    assert benchmark(ring, 1_000_000) == (6044, 19431)
+
+
+def test_transfers_that_meet_nobody(benchmark):
+    def sequence():
+        env = simpy.Environment()
+        net = Network(env, {"wire": Link(1e9, 1e-6)}, {("a", "b"): ["wire"]})
+
+        def program():
+            for _ in range(2000):
+                yield net.transfer("a", "b", 1e6)
+
+        env.process(program())
+        return run(env), net.reratings
+
+    assert benchmark(sequence) == (2 + 3 * 2000, 2000)
+
+
+def test_ten_thousand_flows_that_end_together(benchmark):
+    def burst():
+        env = simpy.Environment()
+        net = Network(env, {"wire": Link(1e9)}, {("a", "b"): ["wire"]})
+        for _ in range(10_000):
+            net.transfer("a", "b", 1e6)
+        return run(env), net.reratings
+
+    assert benchmark(burst) == (10_002, 10_000)
+
+
+def test_the_solver_on_a_fat_tree(benchmark):
+    # 64 hosts in 8 racks, everyone to everyone: rack uplinks are the bottlenecks, in eight rounds.
+    up, down = list(range(64)), list(range(64, 128))
+    rack_up, rack_down = list(range(128, 136)), list(range(136, 144))
+    capacities = [10e9] * 128 + [20e9 + 1e9 * i for i in range(8)] + [50e9] * 8
+    pairs = [(i, j) for i in range(64) for j in range(64) if i // 8 != j // 8]
+    flow_links = [(up[i], rack_up[i // 8], rack_down[j // 8], down[j]) for i, j in pairs]
+    rates = benchmark(max_min_rates, capacities, flow_links)
+    assert len(rates) == 64 * 56
+    assert math.isclose(math.fsum(rates), sum(capacities[link] for link in rack_up))

@@ -1,0 +1,432 @@
+"""What a scheduler may do: the operations of a rank, a GPU with one stream, driven by the machine's host thread.
+
+A policy is a generator a rank. It moves rays, by id; durations come from the devices. The operations are
+stream-ordered, as CUDA's are: a kernel or copy begins when its predecessor on the same GPU is done, and `synchronize`
+is where the host, and so every rank, waits for all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+import simpy
+from numpy.typing import NDArray
+
+from simrender.errors import InvariantError
+from simrender.hardware.machine import Machine
+from simrender.policies.islands import Layout, represented_lines
+from simrender.rays.kinds import CAMERA, SHADOW
+from simrender.rays.partition import Partition
+from simrender.rays.trace import Ids, Trace
+from simrender.timeline import COPIES, KERNELS, Timeline
+
+GENERATE, TRACE, SHADE, TONEMAP, ASSEMBLE = range(len(KERNELS))
+COPY, MERGE = range(len(KERNELS), len(KERNELS + COPIES))
+
+ACCUMULATED_BYTES = 16
+"""A pixel of the accumulation buffer: four floats."""
+PIXEL_BYTES = 4
+"""A finished pixel, RGBA8 (ray queue cycling paper, section 4.8)."""
+
+Steps = Generator[simpy.Event, Any, Any]
+
+
+class Policy(Protocol):
+    """A scheduler: a frozen dataclass whose fields are its parameters."""
+
+    @property
+    def ray_bytes(self) -> float:
+        """Size of a ray in a queue."""
+
+    @property
+    def replicated(self) -> bool:
+        """Whether every rank holds the whole model."""
+
+    @property
+    def first_domain(self) -> int:
+        """How many ranks to the right of its own a ray is traced first."""
+
+    def buffer_bytes(self, pixels: float) -> dict[str, float]:
+        """Return what a rank that renders so many pixels allocates beside the model, by name."""
+
+    def rank(self, me: Rank) -> Steps:
+        """Render the frame on one rank."""
+
+
+@dataclass(frozen=True)
+class Counts:
+    """The queue counters of all ranks, as the host reads them after a shade step; at traced size.
+
+    Attributes
+    ----------
+    paths, shadows : list of int
+        Rays in each rank's queue that continue a path, and shadow rays.
+    pixels : list of int
+        Each rank's share of the image.
+
+    """
+
+    paths: list[int]
+    shadows: list[int]
+    pixels: list[int]
+
+    def any(self) -> bool:
+        """Whether any rank still has rays."""
+        return any(self.paths) or any(self.shadows)
+
+    def room_for_a_wave(self, slots: int) -> bool:
+        """Whether every rank's queue can take a new wave of camera rays beside the rays it holds.
+
+        The rays must fit now, and after the next shade step, in which every path ray may become two.
+        """
+        return all(
+            path + shadow + new <= slots * new and 2 * (path + new) <= slots * new
+            for path, shadow, new in zip(self.paths, self.shadows, self.pixels, strict=True)
+        )
+
+
+class RayQueue:
+    """Rays that travel together, and how far they have come around the ring.
+
+    Attributes
+    ----------
+    ids : int64 array
+        Rows of the ray table.
+    home : int
+        The rank whose pixels they belong to.
+    stage : int
+        How many domains have traced them since they were generated or spawned.
+
+    """
+
+    __slots__ = ("_active", "coherent", "home", "ids", "incoherent", "shadows", "stage")
+
+    def __init__(self, ids: Ids, home: int, kinds: NDArray[np.int64]) -> None:
+        self.ids, self.home, self.stage = ids, home, 0
+        self.coherent = int(kinds[CAMERA])
+        self.incoherent = len(ids) - self.coherent
+        self.shadows = int(kinds[SHADOW])
+        self._active: list[int] | None = None
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def active(self, frame: Frame) -> int:
+        """Return how many incoherent rays are still looking at this stage: shadow rays found occluded are not."""
+        if self._active is None:
+            size = frame.layout.size
+            if size == 1 or self.shadows == 0:
+                self._active = [self.incoherent] * size
+            else:
+                visits = np.bincount(frame.visits(self.ids), minlength=size + 1)
+                done_before = np.cumsum(visits)[:size]  # rays that need no more than 0, 1, 2 ... domains
+                self._active = (self.incoherent - done_before).tolist()
+        return self._active[self.stage]
+
+
+@dataclass
+class Frame:
+    """The state that the ranks of one simulation share.
+
+    Attributes
+    ----------
+    env, machine, layout, trace, partition, policy, timeline
+        What is simulated.
+    visited : callable
+        (generation) -> int16 array: how many domains each of its rays is traced in.
+    weight : float
+        Published rays for which a traced ray stands.
+    published : (width, height)
+        Pixels of the published image.
+
+    """
+
+    env: simpy.Environment
+    machine: Machine
+    layout: Layout
+    trace: Trace
+    partition: Partition
+    policy: Policy
+    timeline: Timeline
+    visited: Callable[[int], NDArray[np.int16]]
+    weight: float
+    published: tuple[int, int]
+    outbox: dict[tuple[int, int], RayQueue] = field(default_factory=dict)
+    retired: list[Ids] = field(default_factory=list)
+    tests: float = 0.0
+    skipped_tests: float = 0.0
+    generations: int = 0
+
+    def __post_init__(self) -> None:
+        self.barrier = Barrier(self.env, self.layout.ranks)
+        self._counts: dict[int, tuple[int, int]] = {}
+        self._visits: list[NDArray[np.int16]] = []
+        self._joined: NDArray[np.int16] = np.zeros(0, np.int16)
+
+    @cached_property
+    def owner(self) -> NDArray[np.int64]:
+        """The rank that renders each traced pixel."""
+        return self.layout.rank_of_line(represented_lines(self.trace.size, self.published[1]))
+
+    @cached_property
+    def pixels_of(self) -> list[Ids]:
+        """The traced pixels of each rank."""
+        order = np.argsort(self.owner, kind="stable")
+        counts = np.bincount(self.owner, minlength=self.layout.ranks)
+        return np.split(order, np.cumsum(counts)[:-1])
+
+    def visits(self, rays: Ids) -> NDArray[np.int16]:
+        """Return how many domains each ray is traced in."""
+        while len(self._joined) <= int(rays.max()):
+            self._visits.append(self.visited(len(self._visits)))
+            self._joined = np.concatenate(self._visits)
+        return self._joined[rays]
+
+    def queue(self, rays: Ids, home: int) -> RayQueue:
+        """Return the given rays as a queue of the rank that owns their pixels."""
+        return RayQueue(rays, home, self.trace.kinds(rays))
+
+
+class Barrier:
+    """All ranks wait until the last has arrived; then an optional closing step may take a while."""
+
+    def __init__(self, env: simpy.Environment, ranks: int) -> None:
+        self._env, self._ranks = env, ranks
+        self._missing, self._event = ranks, env.event()
+
+    def arrive(self, after: list[simpy.Event], closing: Callable[[], int] | None = None) -> simpy.Event:
+        """Announce a rank that is ready when all the given events have happened; return what it must wait for.
+
+        Parameters
+        ----------
+        after : list of Event
+        closing : callable, optional
+            Called when the last rank is ready; returns the tick at which they all go on.
+
+        """
+        event = self._event
+        pending = len(after)
+
+        def ready(_: simpy.Event | None) -> None:
+            nonlocal pending
+            pending -= 1
+            if pending > 0:
+                return
+            self._missing -= 1
+            if self._missing == 0:
+                self._missing, self._event = self._ranks, self._env.event()
+                delay = closing() - int(self._env.now) if closing else 0
+                if delay:
+                    self._env.timeout(delay).callbacks.append(lambda _: event.succeed())
+                else:
+                    event.succeed()
+
+        waiting = [e for e in after if e.callbacks is not None]
+        pending = len(waiting)
+        for each in waiting:
+            each.callbacks.append(ready)
+        if not waiting:
+            pending = 1
+            ready(None)
+        return event
+
+
+class Rank:
+    """One GPU, as a policy sees it.
+
+    Attributes
+    ----------
+    index : int
+        Among the ranks of the frame.
+    domain : int
+        The part of the scene it holds.
+    island_size : int
+        Ranks of its island, which is also the number of domains.
+    left, right : int
+        Its neighbours in its island's ring.
+    samples : int
+        Paths a pixel.
+
+    """
+
+    def __init__(self, frame: Frame, index: int) -> None:
+        self._frame, self.index = frame, index
+        self._gpu = frame.machine.processor(index)
+        self._host = frame.machine.host
+        layout = frame.layout
+        self.domain, self.island_size = layout.domain(index), layout.size
+        self.left, self.right = layout.left(index), layout.right(index)
+        self.samples = frame.trace.samples
+        self._pixels = frame.pixels_of[index]
+        self._shifts = 0
+
+    # -- kernels --------------------------------------------------------------------------------------------------
+
+    def no_rays(self) -> RayQueue:
+        """Return an empty queue."""
+        return self._frame.queue(np.zeros(0, np.int64), self.index)
+
+    def generate(self, sample: int, behind: RayQueue) -> RayQueue:
+        """Write a wave of camera rays, one a pixel of this rank, into the queue behind the rays already there."""
+        frame = self._frame
+        rays = frame.trace.camera_rays(sample, self._pixels)
+        self._kernel(GENERATE, len(rays) * frame.policy.ray_bytes, len(rays))
+        return frame.queue(np.concatenate([behind.ids, rays]) if len(behind) else rays, self.index)
+
+    def trace(self, rays: RayQueue) -> None:
+        """Trace a queue against this rank's domain; shadow rays already known to be occluded are skipped."""
+        self._trace(rays, self._host.issue_launch(), 0.0)
+
+    def _trace(self, rays: RayQueue, issued: int, nbytes: float) -> tuple[int, int]:
+        frame = self._frame
+        active = rays.active(frame)
+        skipped = rays.incoherent - active
+        rays.stage += 1
+        frame.tests += rays.coherent + active
+        frame.skipped_tests += skipped
+        weight = frame.weight
+        seconds = self._gpu.trace_seconds(rays.coherent * weight, active * weight, frame.partition.primitives[self.domain])
+        # A thread whose ray is done reads it and ends.
+        seconds += skipped * weight * frame.policy.ray_bytes / self._gpu.card.memory_bandwidth
+        begin, end = self._gpu.run(seconds, issued)
+        if not nbytes:
+            frame.timeline.add(self.index, TRACE, begin, end, 0.0, (rays.coherent + active) * weight)
+        return begin, end
+
+    def shade(self, rays: RayQueue) -> RayQueue:
+        """Shade the rays, add what they contribute to this rank's pixels, and return the rays they spawn."""
+        frame = self._frame
+        if rays.stage != self.island_size and len(rays):
+            raise InvariantError(f"rank {self.index} shades rays that saw {rays.stage} of {self.island_size} domains")
+        if rays.home != self.index:
+            raise InvariantError(f"rank {self.index} shades rays of rank {rays.home}")
+        frame.retired.append(rays.ids)
+        spawned = frame.queue(frame.trace.children(rays.ids), self.index)
+        pixels = len(rays) - rays.shadows
+        nbytes = (len(rays) + len(spawned)) * frame.policy.ray_bytes + (pixels + rays.shadows) * ACCUMULATED_BYTES
+        self._kernel(SHADE, nbytes, len(rays))
+        return spawned
+
+    def _kernel(self, kind: int, traced_bytes: float, rays: int) -> None:
+        weight = self._frame.weight
+        seconds = self._gpu.stream_seconds(traced_bytes * weight)
+        begin, end = self._gpu.run(seconds, self._host.issue_launch())
+        self._frame.timeline.add(self.index, kind, begin, end, traced_bytes * weight, rays * weight)
+
+    # -- moving rays ----------------------------------------------------------------------------------------------
+
+    def shift(self, rays: RayQueue, to: int) -> Steps:
+        """Copy this rank's queue to another rank once its last kernel is done; wait for all; return what arrived here.
+
+        The explicit copy of section 4.6: the copies of all ranks run at once, and the queues are swapped when the host
+        has seen them all end.
+        """
+        frame = self._frame
+        if self.island_size == 1:
+            return rays
+        issued = self._host.issue_copy()
+        begin = max(self._gpu.free_at, issued)
+        nbytes = len(rays) * frame.policy.ray_bytes * frame.weight
+        copy = frame.machine.network.transfer(self.index, to, nbytes, start=begin)
+        frame.outbox[to, self._shifts] = rays
+        yield from self.synchronize(copy)
+        frame.timeline.add(self.index, COPY, begin, copy.value, nbytes, len(rays) * frame.weight)
+        return self._arrived()
+
+    def _arrived(self) -> RayQueue:
+        """Return the queue that this shift brought; a neighbour that resumed earlier may have sent the next already."""
+        rays = self._frame.outbox.pop((self.index, self._shifts))
+        self._shifts += 1
+        return rays
+
+    def trace_shifted(self, rays: RayQueue, to: int) -> Steps:
+        """Offer a queue to another rank and trace the queue offered to this one, straight out of its owner's memory.
+
+        The implicit copy of section 4.6: the kernel reads the neighbour's rays while it traces them, so it runs until
+        both the tracing and the transfer are done. A kernel's reads use a link less well than a copy engine.
+        """
+        frame = self._frame
+        if self.island_size == 1:
+            self.trace(rays)
+            return rays
+        frame.outbox[to, self._shifts] = rays
+        yield from self.synchronize()
+        rays = self._arrived()
+        nbytes = len(rays) * frame.policy.ray_bytes * frame.weight
+        begin, end = self._trace(rays, self._host.issue_launch(), nbytes)
+        on_the_wire = nbytes / frame.machine.card.fabric.kernel_share
+        read = frame.machine.network.transfer(self.left, self.index, on_the_wire, start=begin)
+        yield from self.synchronize(read)
+        end = max(end, read.value)
+        self._gpu.hold(end)
+        frame.timeline.add(self.index, TRACE, begin, end, nbytes, len(rays) * frame.weight)
+        return rays
+
+    # -- waiting --------------------------------------------------------------------------------------------------
+
+    def synchronize(self, *events: simpy.Event) -> Steps:
+        """Wait until every rank's kernels, and the given copies, are done."""
+        yield self._frame.barrier.arrive(self._done(*events))
+
+    def read_counters(self, rays: RayQueue) -> Steps:
+        """Wait for all ranks, let the host read their queue counters, and return them as `Counts`."""
+        frame = self._frame
+        frame._counts[self.index] = (len(rays) - rays.shadows, rays.shadows)
+        yield frame.barrier.arrive(self._done(), lambda: frame.machine.host.read_counters(frame.layout.ranks))
+        by_rank = [frame._counts[i] for i in range(frame.layout.ranks)]
+        return Counts([p for p, _ in by_rank], [s for _, s in by_rank], [len(p) for p in frame.pixels_of])
+
+    def read_own_counter(self, rays: RayQueue) -> Steps:
+        """Wait for this rank alone, let the host read its queue counter, and return the number of rays."""
+        for event in self._done():
+            yield event
+        yield self._until(self._host.read_counters(1))
+        return len(rays)
+
+    def _done(self, *events: simpy.Event) -> list[simpy.Event]:
+        """Return the events that end everything this rank has in flight."""
+        if self._gpu.free_at > self._frame.env.now:
+            return [*events, self._until(self._gpu.free_at)]
+        return list(events)
+
+    def _until(self, tick: int) -> simpy.Event:
+        env = self._frame.env
+        return env.timeout(max(0, tick - int(env.now)))
+
+    # -- the image ------------------------------------------------------------------------------------------------
+
+    def merge_frame(self) -> Steps:
+        """Tone-map this rank's pixels, copy them to rank 0, and let rank 0 put them in order (section 4.8)."""
+        frame = self._frame
+        pixels = len(self._pixels)
+        real = pixels * self.samples_weight
+        seconds = self._gpu.stream_seconds(real * (ACCUMULATED_BYTES + PIXEL_BYTES))
+        begin, end = self._gpu.run(seconds, self._host.issue_launch())
+        frame.timeline.add(self.index, TONEMAP, begin, end, real * (ACCUMULATED_BYTES + PIXEL_BYTES), 0.0)
+        if frame.layout.ranks > 1:
+            yield from self._gather(real * PIXEL_BYTES)
+        if self.index == 0:
+            nbytes = 2.0 * PIXEL_BYTES * frame.published[0] * frame.published[1]
+            begin, end = self._gpu.run(self._gpu.stream_seconds(nbytes), self._host.issue_launch())
+            frame.timeline.add(0, ASSEMBLE, begin, end, nbytes, 0.0)
+        yield from self.synchronize()
+
+    def _gather(self, nbytes: float) -> Steps:
+        frame = self._frame
+        if self.index == 0:
+            yield from self.synchronize()
+            return
+        begin = max(self._gpu.free_at, self._host.issue_copy())
+        copy = frame.machine.network.transfer(self.index, 0, nbytes, start=begin)
+        yield from self.synchronize(copy)
+        frame.timeline.add(self.index, MERGE, begin, copy.value, nbytes, 0.0)
+
+    @property
+    def samples_weight(self) -> float:
+        """Published pixels for which a traced pixel stands."""
+        frame = self._frame
+        return frame.published[0] * frame.published[1] / frame.trace.pixels

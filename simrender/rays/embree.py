@@ -1,0 +1,104 @@
+"""The one door to embreex.
+
+embreex offers single rays against one level of triangle geometry, in float32, starting at distance 0; it overwrites
+the distances it is given and releases the GIL. Everything here follows from that: scenes are written out without
+instances, secondary origins are offset before they come here, and batches are cut into chunks that run on all cores.
+Scenes are always built robust: without it, rays through shared edges leak between the triangles.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cache
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+F32 = NDArray[np.float32]
+I32 = NDArray[np.int32]
+A = TypeVar("A")
+B = TypeVar("B")
+
+CHUNK = 1 << 15
+"""Rays a thread takes at once: small enough to stay in its cache, large enough to hide Python."""
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """The nearest hit of each ray.
+
+    Attributes
+    ----------
+    t : float32 array (n,)
+        Distance along the ray; infinite for a miss.
+    primitive : int32 array (n,)
+        Row of the triangle in the geometry that was traced; -1 for a miss.
+    u, v : float32 array (n,)
+        Barycentric coordinates of the hit; meaningless for a miss.
+
+    """
+
+    t: F32
+    primitive: I32
+    u: F32
+    v: F32
+
+
+class Geometry:
+    """Triangles in a bounding volume hierarchy that Embree built.
+
+    Parameters
+    ----------
+    vertices : float32 array (v, 3)
+    faces : int32 array (t, 3), t > 0
+
+    """
+
+    def __init__(self, vertices: F32, faces: I32) -> None:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        self._scene = EmbreeScene(robust=True)
+        TriangleMesh(self._scene, vertices, faces)
+        # The hierarchy is built by the first query, which must not happen in two threads at once.
+        self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), query="OCCLUDED")
+
+    def nearest(self, origins: F32, directions: F32, reach: F32) -> Hits:
+        """Return the nearest hit of each ray within its reach; runs on the calling thread.
+
+        Parameters
+        ----------
+        origins, directions : float32 array (n, 3)
+        reach : float32 array (n,)
+            How far each ray goes; not changed.
+
+        """
+        found = self._scene.run(origins, directions, dists=reach.copy(), query="INTERSECT", output=True)
+        primitive = found["primID"]
+        t = np.where(primitive < 0, np.float32(np.inf), found["tfar"])
+        return Hits(t, primitive, found["u"], found["v"])
+
+
+def in_chunks(work: Callable[[slice], B], n: int) -> list[B]:
+    """Apply a function to consecutive chunks of ``range(n)`` on all cores; the results come in order."""
+    return list(_pool().map(work, chunks(n)))
+
+
+def on_all_cores(work: Callable[[A], B], items: Iterable[A]) -> list[B]:
+    """Apply a function to each item on all cores; the results come in order."""
+    return list(_pool().map(work, items))
+
+
+def chunks(n: int) -> list[slice]:
+    """Cut ``range(n)`` into slices of `CHUNK`."""
+    return [slice(start, min(start + CHUNK, n)) for start in range(0, n, CHUNK)]
+
+
+@cache
+def _pool() -> ThreadPoolExecutor:
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return ThreadPoolExecutor(cores, thread_name_prefix="embree")

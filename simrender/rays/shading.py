@@ -1,0 +1,312 @@
+"""The shade (bounce) step of a path tracer: what a hit contributes, and which rays it spawns.
+
+This is section 4.7 of the ray queue cycling paper: diffuse and mirror-like surfaces under an environment, area lights
+and point lights. A diffuse bounce sends one shadow ray to one light, chosen by importance; a path ends at a bounce
+limit or by Russian roulette on its throughput. A ray has at most two children, a bounce and a shadow ray.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from simrender.rays.kinds import CAMERA, DIFFUSE, MIRROR, SHADOW
+from simrender.rays.sampling import cosine_direction, offset_origin, path_key, uniform
+from simrender.rays.scene import Scene
+
+# Dimensions of the random numbers at a surface; lights use two (which, by reservoir) plus three (where) each.
+_LOBE, _ROULETTE, _DIRECTION, _LIGHTS = 0, 1, 2, 4
+_JITTER = 0
+
+
+@dataclass(frozen=True)
+class Bounces:
+    """When a path ends.
+
+    Attributes
+    ----------
+    diffuse, mirror : int
+        The most diffuse and mirror-like bounces of a path.
+    roulette : float
+        A path whose throughput (its largest channel) falls below this survives with the quotient as probability.
+
+    """
+
+    diffuse: int = 3
+    mirror: int = 4
+    roulette: float = 0.3
+
+
+class Surfaces:
+    """A scene's materials and lights as flat arrays, for the kernel.
+
+    Parameters
+    ----------
+    scene : Scene
+
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        triangles = scene.triangles
+        self.vertices, self.faces = triangles.vertices, triangles.faces
+        self.material = scene.mesh_material[triangles.mesh]
+        rows = [(*m.albedo, m.mirror, *m.emission) for m in scene.materials]
+        self.materials = np.array(rows, dtype=np.float64).reshape(-1, 7)
+        sky = scene.environment
+        self.sky = np.array([*sky.zenith, *sky.horizon, *sky.ground, *sky.up], dtype=np.float64)
+        self.points = np.array([(*p.position, *p.intensity) for p in scene.points], np.float64).reshape(-1, 6)
+        # An area light is the set of all triangles of one emissive mesh; a point on it is chosen by area.
+        emits = (self.materials[:, 4:] > 0).any(axis=1)
+        self.light_first, self.light_triangles, self.light_area = _area_lights(scene, emits)
+
+
+def _area_lights(scene: Scene, emits: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]:
+    """Return (first triangle of each light, its triangles, the running area within the light)."""
+    triangles = scene.triangles
+    first, chosen, areas = [0], [], []
+    for mesh in np.flatnonzero(emits[scene.mesh_material]):
+        rows = np.flatnonzero(triangles.mesh == mesh).astype(np.int32)
+        if len(rows) == 0:
+            continue
+        a, b, c = (triangles.vertices[triangles.faces[rows, k]].astype(np.float64) for k in range(3))
+        chosen.append(rows)
+        areas.append(np.cumsum(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)))
+        first.append(first[-1] + len(rows))
+    empty_rows, empty_areas = np.zeros(0, np.int32), np.zeros(0)
+    return np.array(first), np.concatenate([empty_rows, *chosen]), np.concatenate([empty_areas, *areas])
+
+
+def camera_rays(camera: NDArray[np.float64], size: tuple[int, int], seed: int, sample: int) -> tuple[Any, Any]:
+    """Return origins and unit directions of one ray a pixel, float32 (height * width, 3), row by row from the top.
+
+    Parameters
+    ----------
+    camera : float64 array (4, 3)
+        Position, and the image plane at distance 1: forward, right (half its width long), up (half its height long).
+    size : (width, height)
+    seed, sample : int
+        Each sample of a pixel goes through another random point of it.
+
+    """
+    width, height = size
+    origins = np.zeros((width * height, 3), np.float32)
+    directions = np.zeros((width * height, 3), np.float32)
+    _camera_rays(camera, width, height, seed, sample, origins, directions)
+    return origins, directions
+
+
+@njit(cache=True, nogil=True)
+def _camera_rays(camera, width, height, seed, sample, origins, directions):  # type: ignore[no-untyped-def]
+    for pixel in range(width * height):
+        key = path_key(seed, pixel, sample, 0)
+        x = 2.0 * (pixel % width + uniform(key, _JITTER)) / width - 1.0
+        y = 1.0 - 2.0 * (pixel // width + uniform(key, _JITTER + 1)) / height
+        length = 0.0
+        for axis in range(3):
+            component = camera[1, axis] + x * camera[2, axis] + y * camera[3, axis]
+            directions[pixel, axis] = component
+            length += component * component
+        for axis in range(3):
+            origins[pixel, axis] = camera[0, axis]
+            directions[pixel, axis] /= math.sqrt(length)
+
+
+def shade(rays: dict[str, Any], hits: Any, surfaces: Surfaces, bounces: Bounces, seed: int) -> dict[str, Any]:
+    """Shade a chunk of rays.
+
+    Parameters
+    ----------
+    rays : dict of arrays
+        The columns of the ray table: origin, direction, reach, throughput, pixel, sample, kind, diffuse, mirror.
+    hits : Hits
+        Their nearest hits in the whole scene.
+
+    Returns
+    -------
+    dict of arrays
+        For each ray ``radiance`` (float32 (n, 3), what it adds to its pixel) and ``children`` (uint8 (n,), how many it
+        spawns); for its children, in the order of their parents, the columns of the ray table.
+
+    """
+    n = len(rays["kind"])
+    out = {
+        "origin": np.zeros((2 * n, 3), np.float32),
+        "direction": np.zeros((2 * n, 3), np.float32),
+        "throughput": np.zeros((2 * n, 3), np.float32),
+        "reach": np.zeros(2 * n, np.float32),
+        "parent": np.zeros(2 * n, np.int32),
+        "kind": np.zeros(2 * n, np.uint8),
+    }
+    radiance, children = np.zeros((n, 3), np.float32), np.zeros(n, np.uint8)
+    spawned = _shade(
+        rays["direction"], rays["throughput"], rays["pixel"], rays["sample"], rays["kind"], rays["diffuse"],
+        rays["mirror"], hits.t, hits.primitive, hits.u, hits.v,
+        surfaces.vertices, surfaces.faces, surfaces.material, surfaces.materials, surfaces.sky, surfaces.points,
+        surfaces.light_first, surfaces.light_triangles, surfaces.light_area,
+        bounces.diffuse, bounces.mirror, bounces.roulette, seed,
+        radiance, children, out["origin"], out["origin"].view(np.int32), out["direction"], out["throughput"],
+        out["reach"], out["parent"], out["kind"],
+    )  # fmt: skip
+    columns = {name: column[:spawned].copy() for name, column in out.items()}
+    parent = columns["parent"]
+    for name in ("pixel", "sample", "diffuse", "mirror"):
+        columns[name] = rays[name][parent]
+    columns["diffuse"] = columns["diffuse"] + (columns["kind"] == DIFFUSE).astype(np.uint8)
+    columns["mirror"] = columns["mirror"] + (columns["kind"] == MIRROR).astype(np.uint8)
+    return {"radiance": radiance, "children": children, **columns}
+
+
+@njit(cache=True, nogil=True)
+def _sky(sky, dx, dy, dz, channel):  # type: ignore[no-untyped-def]
+    height = dx * sky[9] + dy * sky[10] + dz * sky[11]
+    if height >= 0.0:
+        blend = math.sqrt(height)
+        return sky[3 + channel] * (1.0 - blend) + sky[channel] * blend
+    blend = math.sqrt(-height)
+    return sky[3 + channel] * (1.0 - blend) + sky[6 + channel] * blend
+
+
+@njit(cache=True, nogil=True)
+def _shade(  # type: ignore[no-untyped-def]
+    direction, throughput, pixel, sample, kind, diffuse_bounces, mirror_bounces, t, primitive, u, v,
+    vertices, faces, material_of, materials, sky, points, light_first, light_triangles, light_area,
+    most_diffuse, most_mirror, roulette, seed,
+    radiance, children, out_origin, out_bits, out_direction, out_throughput, out_reach, out_parent, out_kind,
+):  # fmt: skip
+    n_out = 0
+    n_area, n_point = len(light_first) - 1, len(points)
+    for i in range(len(kind)):
+        missed = primitive[i] < 0
+        if kind[i] == SHADOW:
+            if missed:
+                for c in range(3):
+                    radiance[i, c] = throughput[i, c]
+            continue
+        dx, dy, dz = float(direction[i, 0]), float(direction[i, 1]), float(direction[i, 2])
+        if missed:
+            for c in range(3):
+                radiance[i, c] = throughput[i, c] * _sky(sky, dx, dy, dz, c)
+            continue
+
+        # The hit point from the triangle's corners: exact to an ulp however far the ray came (Waechter-Binder).
+        a, b, c3 = faces[primitive[i], 0], faces[primitive[i], 1], faces[primitive[i], 2]
+        ax, ay, az = float(vertices[a, 0]), float(vertices[a, 1]), float(vertices[a, 2])
+        ex, ey, ez = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
+        fx, fy, fz = vertices[c3, 0] - ax, vertices[c3, 1] - ay, vertices[c3, 2] - az
+        px, py, pz = ax + u[i] * ex + v[i] * fx, ay + u[i] * ey + v[i] * fy, az + u[i] * ez + v[i] * fz
+        nx, ny, nz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
+        length = math.sqrt(nx * nx + ny * ny + nz * nz)
+        if length == 0.0:
+            continue  # a degenerate triangle has no side to scatter to
+        length = -length if nx * dx + ny * dy + nz * dz > 0.0 else length
+        nx, ny, nz = nx / length, ny / length, nz / length
+
+        m = materials[material_of[primitive[i]]]
+        if kind[i] != DIFFUSE:  # light that reached a diffuse bounce directly was counted by its shadow ray
+            for c in range(3):
+                radiance[i, c] = throughput[i, c] * m[4 + c]
+
+        key = path_key(seed, pixel[i], sample[i], 1 + diffuse_bounces[i] + mirror_bounces[i])
+        is_mirror = uniform(key, _LOBE) < m[3]
+        if is_mirror and mirror_bounces[i] >= most_mirror or not is_mirror and diffuse_bounces[i] >= most_diffuse:
+            continue
+        tr, tg, tb = throughput[i, 0] * m[0], throughput[i, 1] * m[1], throughput[i, 2] * m[2]
+        strongest = max(tr, tg, tb)
+        if strongest <= 0.0:
+            continue
+
+        survival = min(1.0, strongest / roulette) if roulette > 0.0 else 1.0
+        if uniform(key, _ROULETTE) < survival:
+            if is_mirror:
+                twice = 2.0 * (dx * nx + dy * ny + dz * nz)
+                ox, oy, oz = dx - twice * nx, dy - twice * ny, dz - twice * nz
+            else:
+                ox, oy, oz = cosine_direction(nx, ny, nz, uniform(key, _DIRECTION), uniform(key, _DIRECTION + 1))
+            out_origin[n_out, 0], out_origin[n_out, 1], out_origin[n_out, 2] = px, py, pz
+            offset_origin(out_origin, out_bits, n_out, nx, ny, nz)
+            out_direction[n_out, 0], out_direction[n_out, 1], out_direction[n_out, 2] = ox, oy, oz
+            out_throughput[n_out, 0] = tr / survival
+            out_throughput[n_out, 1] = tg / survival
+            out_throughput[n_out, 2] = tb / survival
+            out_reach[n_out] = np.inf
+            out_parent[n_out], out_kind[n_out] = i, MIRROR if is_mirror else DIFFUSE
+            children[i] += 1
+            n_out += 1
+        if is_mirror:
+            continue
+
+        # One candidate a light, kept with a probability proportional to the light it would carry (reservoir sampling).
+        total, kept, kx, ky, kz, kr, kg, kb = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        kept_area = False
+        mx, my, mz = 0.0, 0.0, 0.0
+        for light in range(n_area + n_point):
+            dimension = _LIGHTS + 4 * light
+            if light < n_area:
+                first, last = light_first[light], light_first[light + 1]
+                area = light_area[last - 1]
+                pick = np.searchsorted(light_area[first:last], uniform(key, dimension) * area, side="right")
+                q = light_triangles[first + min(pick, last - first - 1)]
+                s1, s2 = math.sqrt(uniform(key, dimension + 1)), uniform(key, dimension + 2)
+                la, lb, lc = faces[q, 0], faces[q, 1], faces[q, 2]
+                w0, w1, w2 = 1.0 - s1, s1 * (1.0 - s2), s1 * s2
+                lx = w0 * vertices[la, 0] + w1 * vertices[lb, 0] + w2 * vertices[lc, 0]
+                ly = w0 * vertices[la, 1] + w1 * vertices[lb, 1] + w2 * vertices[lc, 1]
+                lz = w0 * vertices[la, 2] + w1 * vertices[lb, 2] + w2 * vertices[lc, 2]
+                gx, gy, gz = vertices[lb, 0] - vertices[la, 0], vertices[lb, 1] - vertices[la, 1], vertices[lb, 2] - vertices[la, 2]
+                hx, hy, hz = vertices[lc, 0] - vertices[la, 0], vertices[lc, 1] - vertices[la, 1], vertices[lc, 2] - vertices[la, 2]
+                sx, sy, sz = gy * hz - gz * hy, gz * hx - gx * hz, gx * hy - gy * hx
+                size = math.sqrt(sx * sx + sy * sy + sz * sz)
+            else:
+                lx, ly, lz = points[light - n_area, 0], points[light - n_area, 1], points[light - n_area, 2]
+                size = 1.0
+                sx, sy, sz = 0.0, 0.0, 0.0
+            wx, wy, wz = lx - px, ly - py, lz - pz
+            squared = wx * wx + wy * wy + wz * wz
+            if squared <= 0.0 or size <= 0.0:
+                continue
+            away = math.sqrt(squared)
+            cosine = (wx * nx + wy * ny + wz * nz) / away
+            if cosine <= 0.0:
+                continue
+            if light < n_area:
+                facing = (wx * sx + wy * sy + wz * sz) / (away * size)
+                geometry = cosine * abs(facing) * area / (squared * math.pi)
+                le = materials[material_of[q]]
+                cr, cg, cb = tr * le[4] * geometry, tg * le[5] * geometry, tb * le[6] * geometry
+                # The light's own surface must not shadow it: aim at a point moved off it, towards the ray.
+                flip = -1.0 if facing > 0.0 else 1.0
+                sx, sy, sz = flip * sx / size, flip * sy / size, flip * sz / size
+            else:
+                geometry = cosine / (squared * math.pi)
+                power = points[light - n_area]
+                cr, cg, cb = tr * power[3] * geometry, tg * power[4] * geometry, tb * power[5] * geometry
+            weight = 0.2126 * cr + 0.7152 * cg + 0.0722 * cb
+            total += weight
+            if weight > 0.0 and uniform(key, dimension + 3) * total < weight:
+                kept, kx, ky, kz, kr, kg, kb = weight, lx, ly, lz, cr, cg, cb
+                kept_area, mx, my, mz = light < n_area, sx, sy, sz
+        if kept <= 0.0:
+            continue
+        # The origin's row serves as scratch for the target, so that it is offset in float32 like any origin.
+        if kept_area:
+            out_origin[n_out, 0], out_origin[n_out, 1], out_origin[n_out, 2] = kx, ky, kz
+            offset_origin(out_origin, out_bits, n_out, mx, my, mz)
+            kx, ky, kz = out_origin[n_out, 0], out_origin[n_out, 1], out_origin[n_out, 2]
+        out_origin[n_out, 0], out_origin[n_out, 1], out_origin[n_out, 2] = px, py, pz
+        offset_origin(out_origin, out_bits, n_out, nx, ny, nz)
+        wx, wy, wz = kx - out_origin[n_out, 0], ky - out_origin[n_out, 1], kz - out_origin[n_out, 2]
+        away = math.sqrt(wx * wx + wy * wy + wz * wz)
+        out_direction[n_out, 0], out_direction[n_out, 1], out_direction[n_out, 2] = wx / away, wy / away, wz / away
+        out_throughput[n_out, 0] = kr * total / kept
+        out_throughput[n_out, 1] = kg * total / kept
+        out_throughput[n_out, 2] = kb * total / kept
+        out_reach[n_out] = away
+        out_parent[n_out], out_kind[n_out] = i, SHADOW
+        children[i] += 1
+        n_out += 1
+    return n_out

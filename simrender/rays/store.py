@@ -1,0 +1,80 @@
+"""A folder of arrays named by the content they were computed from.
+
+Each file is a NumPy archive without pickles, written to the side and moved into place, and checked by its CRC when it
+is read. A file that cannot be read is removed and computed again, with one warning.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import warnings
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+FORMAT_VERSION = 1
+"""Part of every key: raise it when the meaning of a stored column changes."""
+
+
+class CacheWarning(UserWarning):
+    """The trace cache is damaged or cannot be written; the run goes on without it."""
+
+
+def default_folder() -> Path:
+    """Return ``$SIMRENDER_CACHE``, or ``simrender`` in the user's cache folder."""
+    if folder := os.environ.get("SIMRENDER_CACHE"):
+        return Path(folder)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "simrender"
+
+
+class Store:
+    """Arrays on disk under one key.
+
+    Parameters
+    ----------
+    key : str
+        Hash of everything the arrays depend on.
+    folder : Path, optional
+        The cache; by default `default_folder`.
+
+    """
+
+    def __init__(self, key: str, folder: Path | None = None) -> None:
+        self.folder = (folder or default_folder()) / f"v{FORMAT_VERSION}" / key
+        self._warned = False
+
+    def load(self, name: str) -> dict[str, Any] | None:
+        """Return the arrays stored under a name, or None if there are none or they are damaged."""
+        path = self.folder / f"{name}.npz"
+        try:
+            with np.load(path, allow_pickle=False) as archive:
+                return {column: archive[column] for column in archive.files}
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zipfile.LargeZipFile) as error:
+            self._warn(f"the cache file {path} is damaged ({error}); it is discarded and computed again")
+            path.unlink(missing_ok=True)
+            return None
+
+    def save(self, name: str, columns: dict[str, Any]) -> None:
+        """Store arrays under a name; a folder that cannot be written costs a warning, not the run."""
+        path = self.folder / f"{name}.npz"
+        temporary = ""
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            handle, temporary = tempfile.mkstemp(dir=self.folder, prefix=f".{name}-")
+            with os.fdopen(handle, "wb") as file:
+                np.savez(file, allow_pickle=False, **columns)
+            Path(temporary).replace(path)
+        except OSError as error:
+            if temporary:
+                Path(temporary).unlink(missing_ok=True)
+            self._warn(f"cannot write the trace cache in {self.folder}: {error.strerror or error}; set SIMRENDER_CACHE")
+
+    def _warn(self, message: str) -> None:
+        if not self._warned:
+            warnings.warn(message, CacheWarning, stacklevel=3)
+        self._warned = True

@@ -1,0 +1,301 @@
+"""The ray table: every ray of a frame, traced once and replayed for every what-if.
+
+Rays live in columns, a generation (bounce) after the other. Generation 0 holds the camera rays, sample by sample and
+row by row; the children of generation g, in the order of their parents, are generation g + 1. A ray's id is its row
+through all generations, so it depends on the scene, the camera and the seed alone, never on a scheduler. A generation
+comes into being when somebody first asks for its rays, and is then kept in memory and on disk.
+
+============ ======== =============================================================================
+column       dtype    meaning
+============ ======== =============================================================================
+origin       3 x f4
+direction    3 x f4   unit vector
+reach        f4       how far the ray goes: to the light for a shadow ray, else infinite
+throughput   3 x f4   for a shadow ray, the light it brings unless something is in the way
+pixel        i4       row-major from the top left
+sample       u2       which path of the pixel
+kind         u1       camera, diffuse, mirror or shadow: see `kinds.KINDS`
+diffuse      u1       diffuse bounces so far; with ``mirror`` it gives the depth
+mirror       u1       mirror-like bounces so far
+parent       i4       row within the previous generation
+t            f4       distance of the nearest hit over the whole scene; infinite for a miss
+primitive    i4       global id of the triangle hit; -1 for a miss
+radiance     3 x f4   what the ray adds to its pixel when it is retired
+children     u1       how many rays it spawns: 0, 1 or 2
+============ ======== =============================================================================
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simrender.rays import embree
+from simrender.rays.kinds import CAMERA, KINDS
+from simrender.rays.scene import Scene
+from simrender.rays.store import FORMAT_VERSION, Store
+
+if TYPE_CHECKING:
+    from simrender.rays.shading import Bounces, Surfaces
+
+Ids = NDArray[np.int64]
+Columns = dict[str, Any]
+
+GEOMETRY = ("origin", "direction", "reach", "throughput", "pixel", "sample", "kind", "diffuse", "mirror", "parent")
+OUTCOME = ("t", "primitive", "radiance", "children", "kind", "pixel")
+"""What a replay needs, stored apart from the geometry so that it reads no more than this."""
+
+Progress = Callable[[int, int], None]
+"""Called with (generation, rays in it) before a generation is traced."""
+
+
+class Trace:
+    """All rays of one frame of one scene.
+
+    Parameters
+    ----------
+    scene : Scene
+    camera : float64 array (4, 3)
+        Position, forward, right, up, as `shading.camera_rays` takes it.
+    size : (width, height)
+        Traced pixels.
+    samples : int
+        Paths a pixel.
+    bounces : Bounces
+        When paths end.
+    seed : int
+        Of all random numbers.
+    cache : Path or None
+        Folder of the trace cache; None takes the default one.
+    progress : callable, optional
+        Told before each generation is traced.
+
+    Attributes
+    ----------
+    traced_rays : int
+        Rays that Embree was asked for in this process; 0 when everything came from the cache.
+
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        camera: NDArray[np.float64],
+        size: tuple[int, int],
+        samples: int,
+        bounces: Bounces,
+        seed: int = 1,
+        cache: Path | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        self.scene, self.camera, self.size, self.samples = scene, camera, size, samples
+        self.bounces, self.seed, self.progress = bounces, seed, progress
+        self.pixels = size[0] * size[1]
+        facts = f"{FORMAT_VERSION} {scene.key} {camera.tobytes().hex()} {size} {samples} {bounces} {seed}"
+        self.key = hashlib.blake2b(facts.encode(), digest_size=16).hexdigest()
+        self.store = Store(self.key, cache)
+        self.traced_rays = 0
+        self.first: list[int] = [0]  # first id of each generation, then the number of rays known so far
+        self._outcomes: list[Columns] = []
+        self._geometry: dict[int, Columns] = {}
+        self._joined: dict[str, Any] = {}
+
+    # -- what schedulers ask --------------------------------------------------------------------------------------
+
+    def kinds(self, rays: Ids) -> NDArray[np.int64]:
+        """Return how many of the rays are of each kind, int64 (4,)."""
+        if len(rays) == 0:
+            return np.zeros(len(KINDS), np.int64)
+        self._know(int(rays.max()))
+        return np.bincount(self.column("kind")[rays], minlength=len(KINDS))
+
+    def camera_rays(self, sample: int, pixels: Ids) -> Ids:
+        """Return the ids of one sample's camera rays of the given pixels."""
+        return pixels + sample * self.pixels
+
+    def children(self, rays: Ids) -> Ids:
+        """Return the ids of the rays that the given rays spawn; their order means nothing."""
+        if len(rays) == 0:
+            return rays
+        self._know(int(rays.max()))
+        spawned, first = self.column("children")[rays], self.column("first_child")[rays]
+        return np.concatenate([first[spawned > 0], first[spawned > 1] + 1])
+
+    def column(self, name: str) -> Any:
+        """Return an outcome column over all generations known so far, one row a ray."""
+        if name not in self._joined:
+            self._joined[name] = np.concatenate([g[name] for g in self._outcomes])
+        return self._joined[name]
+
+    @property
+    def rays(self) -> int:
+        """Number of rays known so far; of all rays, after `complete`."""
+        return self.first[-1]
+
+    @property
+    def generations(self) -> int:
+        """Number of generations known so far."""
+        return len(self._outcomes)
+
+    def complete(self) -> None:
+        """Trace every generation until no ray spawns another."""
+        while self._advance():
+            pass
+
+    def generation_of(self, ray: int) -> int:
+        """Return the generation of a ray."""
+        self._know(ray)
+        return int(np.searchsorted(self.first, ray, side="right")) - 1
+
+    def image(self, retired: Ids | None = None) -> NDArray[np.float32]:
+        """Return the image that the retired rays make, float32 (height, width, 3): mean radiance of the samples.
+
+        Contributions are summed in double precision in the order of ray ids, whatever the order of retirement.
+
+        Parameters
+        ----------
+        retired : int64 array, optional
+            Sorted ids; by default all rays.
+
+        """
+        pixel, radiance = self.column("pixel"), self.column("radiance")
+        if retired is not None:
+            pixel, radiance = pixel[retired], radiance[retired]
+        lit = np.flatnonzero(radiance.any(axis=1))
+        sums = [np.bincount(pixel[lit], radiance[lit, c], minlength=self.pixels) for c in range(3)]
+        image = np.stack(sums, axis=1) / self.samples
+        return image.reshape(self.size[1], self.size[0], 3).astype(np.float32)
+
+    def geometry(self, generation: int) -> Columns:
+        """Return the geometry columns of one generation."""
+        self._know(self.first[generation])
+        if generation not in self._geometry:
+            found = self.store.load(f"{generation:03d}-rays")
+            rays = self.first[generation + 1] - self.first[generation]
+            if found is None or not _fits(found, GEOMETRY, rays):
+                # Damaged since it was written: the same rays come out when they are traced again.
+                again = Trace(self.scene, self.camera, self.size, self.samples, self.bounces, self.seed)
+                again.store = _Nowhere()
+                again._know(self.first[generation])
+                found = again._geometry[generation]
+                self.store.save(f"{generation:03d}-rays", found)
+            self._geometry[generation] = found
+        return self._geometry[generation]
+
+    # -- how it comes about ---------------------------------------------------------------------------------------
+
+    @cached_property
+    def surfaces(self) -> Surfaces:
+        """The scene as the shading kernel takes it; made when the first ray is really traced."""
+        from simrender.rays.shading import Surfaces
+
+        return Surfaces(self.scene)
+
+    @cached_property
+    def everything(self) -> embree.Geometry:
+        """The whole scene in one hierarchy; built when the first ray is really traced."""
+        return embree.Geometry(self.scene.triangles.vertices, self.scene.triangles.faces)
+
+    def _know(self, ray: int) -> None:
+        while self.first[-1] <= ray:
+            if not self._advance():
+                raise IndexError(f"ray {ray} does not exist: the trace has {self.rays} rays")
+
+    def _advance(self) -> bool:
+        """Make the next generation known; False if the last one spawned nothing."""
+        generation = self.generations
+        if generation and not self._outcomes[-1]["children"].any():
+            return False
+        outcome = self._load(generation) or self._trace(generation)
+        count = len(outcome["children"])
+        spawned = outcome["children"].astype(np.int64)
+        outcome["first_child"] = self.first[-1] + count + np.cumsum(spawned) - spawned
+        self._outcomes.append(outcome)
+        self.first.append(self.first[-1] + count)
+        self._joined.clear()
+        return True
+
+    def _load(self, generation: int) -> Columns | None:
+        outcome = self.store.load(f"{generation:03d}-hits")
+        expected = int(self._outcomes[-1]["children"].sum()) if generation else self.pixels * self.samples
+        return outcome if outcome and _fits(outcome, OUTCOME, expected) else None
+
+    def _trace(self, generation: int) -> Columns:
+        from simrender.rays import shading
+
+        rays = self._first_rays() if generation == 0 else self._spawned_rays(generation)
+        count = len(rays["kind"])
+        if self.progress:
+            self.progress(generation, count)
+        scene, surfaces = self.everything, self.surfaces
+
+        def work(rows: slice) -> Columns:
+            chunk = {name: column[rows] for name, column in rays.items()}
+            hits = scene.nearest(chunk["origin"], chunk["direction"], chunk["reach"])
+            shaded = shading.shade(chunk, hits, surfaces, self.bounces, self.seed)
+            shaded["parent"] = shaded["parent"] + np.int32(rows.start)
+            return shaded | {"t": hits.t, "primitive": hits.primitive}
+
+        parts = embree.in_chunks(work, count)
+        self.traced_rays += count
+        outcome = {n: np.concatenate([p[n] for p in parts]) for n in ("t", "primitive", "radiance", "children")}
+        outcome |= {"kind": rays["kind"], "pixel": rays["pixel"]}
+        self._geometry[generation] = rays
+        self._geometry[generation + 1] = {n: np.concatenate([p[n] for p in parts]) for n in GEOMETRY}
+        if generation == 0:
+            self.store.save("000-rays", rays)
+        # The next generation's rays before these hits: a run that was cut off goes on from them.
+        self.store.save(f"{generation + 1:03d}-rays", self._geometry[generation + 1])
+        self.store.save(f"{generation:03d}-hits", outcome)
+        return outcome
+
+    def _first_rays(self) -> Columns:
+        from simrender.rays import shading
+
+        cast = [shading.camera_rays(self.camera, self.size, self.seed, s) for s in range(self.samples)]
+        n = self.pixels * self.samples
+        return {
+            "origin": np.concatenate([o for o, _ in cast]),
+            "direction": np.concatenate([d for _, d in cast]),
+            "reach": np.full(n, np.inf, np.float32),
+            "throughput": np.ones((n, 3), np.float32),
+            "pixel": np.tile(np.arange(self.pixels, dtype=np.int32), self.samples),
+            "sample": np.repeat(np.arange(self.samples, dtype=np.uint16), self.pixels),
+            "kind": np.full(n, CAMERA, np.uint8),
+            "diffuse": np.zeros(n, np.uint8),
+            "mirror": np.zeros(n, np.uint8),
+            "parent": np.full(n, -1, np.int32),
+        }
+
+    def _spawned_rays(self, generation: int) -> Columns:
+        if generation not in self._geometry:
+            found = self.store.load(f"{generation:03d}-rays")
+            expected = int(self._outcomes[-1]["children"].sum())
+            if found is None or not _fits(found, GEOMETRY, expected):
+                self._trace(generation - 1)
+                found = self._geometry[generation]
+            self._geometry[generation] = found
+        return self._geometry[generation]
+
+
+class _Nowhere(Store):
+    """A store that keeps nothing."""
+
+    def __init__(self) -> None:
+        super().__init__("nowhere")
+
+    def load(self, name: str) -> None:  # noqa: ARG002
+        return None
+
+    def save(self, name: str, columns: Columns) -> None:
+        pass
+
+
+def _fits(columns: Columns, names: tuple[str, ...], rows: int) -> bool:
+    return set(names) <= columns.keys() and all(len(columns[name]) == rows for name in names)

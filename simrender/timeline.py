@@ -1,0 +1,92 @@
+"""Spans: who did what, when. The event log of a simulation and what can be read from it."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from simrender.clock import TICKS_PER_SECOND
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+KERNELS: Final = ("generate", "trace", "shade", "tonemap", "assemble")
+"""Spans during which a GPU computes."""
+
+COPIES: Final = ("copy", "merge")
+"""Spans during which a GPU sends: ray queues, and finished pixels."""
+
+
+@dataclass
+class Timeline:
+    """Everything that took time, in the order in which it was settled.
+
+    Attributes
+    ----------
+    gpus : int
+        How many GPUs there are rows for.
+    device, kind, start, end : list of int
+        Index of the GPU, index into ``KERNELS + COPIES``, and the ticks.
+    nbytes, rays : list of float
+        What a span moved or worked on, at published size.
+
+    """
+
+    gpus: int
+    device: list[int] = field(default_factory=list)
+    kind: list[int] = field(default_factory=list)
+    start: list[int] = field(default_factory=list)
+    end: list[int] = field(default_factory=list)
+    nbytes: list[float] = field(default_factory=list)
+    rays: list[float] = field(default_factory=list)
+
+    def add(self, device: int, kind: int, start: int, end: int, nbytes: float, rays: float) -> None:
+        """Log a span."""
+        self.device.append(device)
+        self.kind.append(kind)
+        self.start.append(start)
+        self.end.append(end)
+        self.nbytes.append(nbytes)
+        self.rays.append(rays)
+
+    def __len__(self) -> int:
+        return len(self.device)
+
+    def sha256(self) -> str:
+        """Return the hash of the log: equal for equal simulations, down to the picosecond and the order of events."""
+        digest = hashlib.sha256(repr((KERNELS, COPIES, self.gpus)).encode())
+        for column in (self.device, self.kind, self.start, self.end):
+            digest.update(np.array(column, dtype="<i8"))
+        for column in (self.nbytes, self.rays):
+            digest.update(np.array(column, dtype="<f8"))
+        return digest.hexdigest()
+
+    def frame(self) -> pd.DataFrame:
+        """Return the spans as a table: device, kind, start_s, end_s, bytes, rays; sorted by start, then device."""
+        import pandas as pd
+
+        names = np.array(KERNELS + COPIES)
+        table = pd.DataFrame(
+            {
+                "device": [f"gpu{d}" for d in self.device],
+                "kind": names[np.array(self.kind, dtype=int)] if self.kind else [],
+                "start_s": np.array(self.start, dtype=float) / TICKS_PER_SECOND,
+                "end_s": np.array(self.end, dtype=float) / TICKS_PER_SECOND,
+                "bytes": np.array(self.nbytes, dtype=float),
+                "rays": np.array(self.rays, dtype=float),
+            }
+        )
+        order = np.lexsort((np.array(self.device), np.array(self.start)))
+        return table.iloc[order].reset_index(drop=True)
+
+    def seconds_by_kind(self) -> dict[str, list[float]]:
+        """Return, for each kind of span, the seconds that each GPU spent on it."""
+        device, kind = np.array(self.device, dtype=int), np.array(self.kind, dtype=int)
+        seconds = (np.array(self.end, dtype=float) - np.array(self.start, dtype=float)) / TICKS_PER_SECOND
+        return {
+            name: np.bincount(device[kind == k], seconds[kind == k], minlength=self.gpus).tolist()
+            for k, name in enumerate(KERNELS + COPIES)
+        }
