@@ -3,7 +3,7 @@
 No number about hardware or a published scene stands in code. A quantity on a card is plain (``48 GiB``) or says where
 it comes from::
 
-    bandwidth: {value: "145.57 GB/s", range: ["140 GB/s", "146 GB/s"], source: "p2pBandwidthLatencyTest", status: measured}
+    bandwidth: {value: 145.57 GB/s, range: [140 GB/s, 146 GB/s], source: "p2pBandwidthLatencyTest", status: measured}
 
 All mistakes of a card are reported at once, each as ``file:line:column: path: message``.
 """
@@ -65,6 +65,7 @@ class Quantity(float):
         source: str = "",
         range: tuple[float, float] | None = None,  # noqa: A002 - the card's own word
     ) -> Quantity:
+        """Make a quantity; `text` defaults to the number."""
         self = super().__new__(cls, value)
         self.text, self.status, self.source, self.range = text or repr(float(value)), status, source, range
         return self
@@ -73,7 +74,9 @@ class Quantity(float):
 class _Reads:
     """Pydantic annotation: reads a quantity of one dimension, plain or with provenance."""
 
-    def __init__(self, dimension: str, *, above: float = 0.0, allow_equal: bool = False, at_most: float = math.inf) -> None:
+    def __init__(
+        self, dimension: str, *, above: float = 0.0, allow_equal: bool = False, at_most: float = math.inf
+    ) -> None:
         self.dimension, self.above, self.allow_equal, self.at_most = dimension, above, allow_equal, at_most
 
     def _number(self, text: Any) -> float:
@@ -184,7 +187,8 @@ class Document:
         except yaml.YAMLError as error:
             raise CardError([f"{where}: not valid YAML: {' '.join(str(error).split())}"]) from None
         if not isinstance(node, yaml.MappingNode):
-            raise CardError([f"{where}:1:1: a card is a mapping of fields, got {'nothing' if node is None else node.id}"])
+            got = "nothing" if node is None else "a list" if isinstance(node, yaml.SequenceNode) else "a single value"
+            raise CardError([f"{where}:1:1: a card is a mapping of fields, got {got}"])
         self._loader = yaml.SafeLoader("")
         self.data: dict[str, Any] = self._construct(node, ())
         if self._mistakes:
@@ -195,7 +199,7 @@ class Document:
         if isinstance(node, yaml.MappingNode):
             mapping: dict[Any, Any] = {}
             for key_node, value_node in node.value:
-                key = self._loader.construct_object(key_node, deep=True)  # type: ignore[no-untyped-call]
+                key = self._loader.construct_object(key_node, deep=True)
                 if key in mapping:
                     self._mistakes.append(f"{self._at(key_node)}: {dotted((*path, key))}: this field stands twice")
                 self.keys[(*path, key)] = self._at(key_node)
@@ -203,7 +207,7 @@ class Document:
             return mapping
         if isinstance(node, yaml.SequenceNode):
             return [self._construct(item, (*path, i)) for i, item in enumerate(node.value)]
-        return self._loader.construct_object(node, deep=True)  # type: ignore[no-untyped-call]
+        return self._loader.construct_object(node, deep=True)
 
     def _at(self, node: yaml.Node) -> str:
         return f"{self.where}:{node.start_mark.line + 1}:{node.start_mark.column + 1}"
@@ -235,12 +239,15 @@ class Document:
         dotted_path, _, text = assignment.partition("=")
         spelled = f"--set {section}.{dotted_path}"
         parts: Path = tuple(int(p) if p.isdigit() else p for p in dotted_path.split("."))
-        target, shape = self.data, model
+        target: Any = self.data
+        shape: Any = model
         for depth, part in enumerate(parts):
             here, known = dotted((section, *parts[:depth])), field_types(shape)
             if known is not None and part not in known:
                 suggestion = did_you_mean(str(part), known)
-                raise CardError([f"{spelled}: {here} has no field {str(part)!r}{suggestion} (it has: {', '.join(known)})"])
+                raise CardError(
+                    [f"{spelled}: {here} has no field {str(part)!r}{suggestion} (it has: {', '.join(known)})"]
+                )
             shape = known[str(part)] if known is not None else _item_type(shape, part)
             if shape is None:
                 raise CardError([f"{spelled}: {here} is a single value, without parts"])
@@ -286,7 +293,11 @@ class Document:
             message = message.removeprefix("Value error, ")
         elif kind != "quantity":
             message = f"{message.removeprefix('Input ')}, got {given!r}"
-        return f"{position}{dotted(path)}: {message}" if position.endswith(".") else f"{position}: {dotted(path)}: {message}"
+        return (
+            f"{position}{dotted(path)}: {message}"
+            if position.endswith(".")
+            else f"{position}: {dotted(path)}: {message}"
+        )
 
 
 def dotted(path: Iterable[str | int]) -> str:
@@ -351,9 +362,11 @@ def split_assignments(assignments: Iterable[str], sections: Sequence[str]) -> di
         path, equals, _ = assignment.partition("=")
         section, dot, rest = path.partition(".")
         if not equals:
-            raise UsageError(f"--set {assignment}: expected PATH=VALUE, for instance machine.nvlink.bandwidth='300 GB/s'")
+            raise UsageError(
+                f"--set {assignment}: expected PATH=VALUE, for instance machine.nvlink.bandwidth='300 GB/s'"
+            )
         if section not in sorted_ or not dot or not rest:
-            suggestion = did_you_mean(section, sections)
-            raise UsageError(f"--set {assignment}: a path starts with {', '.join(f'{s}.' for s in sections)} got {path!r}{suggestion}")
+            suggestion, starts = did_you_mean(section, sections), " or ".join(f"{s}." for s in sections)
+            raise UsageError(f"--set {assignment}: a path starts with {starts}, got {path!r}{suggestion}")
         sorted_[section].append(assignment.partition(".")[2])
     return sorted_

@@ -20,11 +20,11 @@ from simrender.errors import InvariantError, UsageError
 from simrender.hardware.machine import Machine, MachineCard, check_gpus, load_machine
 from simrender.policies.islands import Fit, fit
 from simrender.policies.rank import Frame, Policy, Rank
-from simrender.rays.partition import Footprint, Partition
 from simrender.rays.kinds import KINDS, SHADOW
+from simrender.rays.partition import Footprint, Method, Partition
 from simrender.rays.trace import Progress, Trace
 from simrender.rays.workload import Workload, load_workload
-from simrender.timeline import COPIES, KERNELS, Timeline
+from simrender.timeline import KERNELS, Timeline
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,7 +32,10 @@ if TYPE_CHECKING:
 Islands = int | Literal["auto"]
 
 LEFT_OUT = (
-    ("loading the scene and building acceleration structures", "a frame of an animation or an interactive session has them"),
+    (
+        "loading the scene and building acceleration structures",
+        "a frame of an animation or an interactive session has them",
+    ),
     ("textures and alpha tests", "their cost is inside the calibrated trace rates, the same for every ray"),
     ("arithmetic of the shade, generate and tone-mapping kernels", "they are charged for the memory they move"),
     ("the display and the way to it", "the frame ends when its pixels are in order on GPU 0"),
@@ -52,7 +55,7 @@ class Result:
     feasible : bool
         Whether the model and the queues fit. Where they do not, nothing was simulated: times and hashes are None.
     memory : dict
-        ``needed_bytes`` (of the fullest GPU), ``capacity_bytes``, ``model_bytes`` and each buffer's bytes of that GPU, and
+        ``needed_bytes`` (of the fullest GPU), ``capacity_bytes``, ``model_bytes`` and each buffer's bytes of that GPU;
         ``gpus_needed``, the smallest number of such GPUs that would do (None if none would).
     frame_time_s : float or None
     utilization : dict
@@ -170,7 +173,7 @@ def simulate(
     name, scheduler = _policy(policy, workload, given.get("policy", ()))
     if scheduler.replicated and islands not in {"auto", count}:
         raise UsageError(
-            f"--islands {islands}: {name} holds the whole model on every GPU, so it always has as many islands as GPUs; "
+            f"--islands {islands}: {name} holds the whole model on every GPU, so every GPU is an island; "
             f"use a data-parallel policy such as ray_queue_cycling"
         )
 
@@ -196,7 +199,7 @@ def simulate(
     trace = workload.trace(seed, progress)
     frame = Frame(
         env, devices, layout, trace, partition, scheduler, Timeline(layout.ranks),
-        visited=_visited(workload, trace, partition, scheduler, layout.size, seed, lambda: frame.owner),
+        visited=_visited(workload, partition, scheduler, seed, lambda: frame.owner),
         weight=workload.weight, published=workload.card.published.resolution,
     )  # fmt: skip
     buffers = _buffers(scheduler, workload, layout.ranks)
@@ -299,7 +302,7 @@ def _place(
 ) -> tuple[Fit, Partition, dict[str, Any]]:
     """Choose the islands, and say what each GPU must hold."""
     footprint = Footprint(float(card.gpu.bvh_triangle_bytes), float(card.gpu.bvh_instance_bytes))
-    method = getattr(policy, "partition", "heaviest_first")
+    method: Method = getattr(policy, "partition", "heaviest_first")
     split_share = getattr(policy, "split_share", 1.0)
 
     def parts(size: int) -> Partition:
@@ -307,7 +310,10 @@ def _place(
 
     def need(count: int, size: int) -> NDArray[np.float64]:
         model = parts(size).weight_bytes[np.arange(count * size) % size]
-        return model + np.array([sum(b.values()) for b in _buffers(policy, workload, count * size)])
+        needed: NDArray[np.float64] = model + np.array(
+            [sum(b.values()) for b in _buffers(policy, workload, count * size)]
+        )
+        return needed
 
     capacity = float(card.gpu.memory - card.gpu.reserved_memory)
     chosen = fit(gpus, None if islands == "auto" else islands, need, capacity, replicated=policy.replicated)
@@ -336,11 +342,12 @@ def _buffers(policy: Policy, workload: Workload, ranks: int) -> list[dict[str, f
 
 
 def _visited(
-    workload: Workload, trace: Trace, partition: Partition, policy: Policy, size: int, seed: int,
-    owner: Callable[[], NDArray[np.int64]],
-) -> Callable[[int], NDArray[np.int16]]:  # fmt: skip
+    workload: Workload, partition: Partition, policy: Policy, seed: int, owner: Callable[[], NDArray[np.int64]]
+) -> Callable[[int], NDArray[np.int16]]:
+    """Return the function that tells a frame how far around the ring each ray of a generation is really traced."""
+
     def visited(generation: int) -> NDArray[np.int16]:
-        start = (owner() + policy.first_domain) % size
+        start = (owner() + policy.first_domain) % partition.domains
         return workload.crossings(seed, partition).domains_visited(generation, start)
 
     return visited
@@ -388,7 +395,9 @@ def _counts(frame: Frame, machine: Machine) -> dict[str, float]:
         "kernels": int((kind < len(KERNELS)).sum()),
         "trace_kernels": int((kind == KERNELS.index("trace")).sum()),
         "copies": int((kind >= len(KERNELS)).sum()),
-        "published_copied_bytes": float(sum(b for b, k in zip(log.nbytes, log.kind, strict=True) if k >= len(KERNELS) or KERNELS[k] == "trace")),
+        "published_copied_bytes": float(
+            sum(b for b, k in zip(log.nbytes, log.kind, strict=True) if k >= len(KERNELS) or KERNELS[k] == "trace")
+        ),
         "network_bytes": machine.network.sent_bytes if machine.has_network else 0.0,
         "spans": len(log),
     }

@@ -58,10 +58,10 @@ class Timeline:
     def sha256(self) -> str:
         """Return the hash of the log: equal for equal simulations, down to the picosecond and the order of events."""
         digest = hashlib.sha256(repr((KERNELS, COPIES, self.gpus)).encode())
-        for column in (self.device, self.kind, self.start, self.end):
-            digest.update(np.array(column, dtype="<i8"))
-        for column in (self.nbytes, self.rays):
-            digest.update(np.array(column, dtype="<f8"))
+        for ticks in (self.device, self.kind, self.start, self.end):
+            digest.update(np.array(ticks, dtype="<i8").tobytes())
+        for amounts in (self.nbytes, self.rays):
+            digest.update(np.array(amounts, dtype="<f8").tobytes())
         return digest.hexdigest()
 
     def frame(self) -> pd.DataFrame:

@@ -50,7 +50,9 @@ def _table() -> dict[str, tuple[str, float]]:
 
 
 _UNITS: Final = _table()
-_QUANTITY: Final = re.compile(r"\s*([-+]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf)\b)\s*(.*?)\s*", re.I)
+_QUANTITY: Final = re.compile(
+    r"\s*([-+]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf)\b)\s*(.*?)\s*", re.I
+)
 
 
 def describe(dimension: str) -> str:
@@ -107,7 +109,9 @@ def _finite(value: float, expected: str) -> float:
 
 def _candidates(unit: str, dimension: str) -> list[str]:
     """Return the units worth suggesting for an unknown one: those of the expected dimension first."""
-    spelled_out = unit.replace("bps", "b/s").replace("Bps", "B/s").replace("bit", "b").replace("yte", "").removesuffix("s/s")
+    spelled_out = (
+        unit.replace("bps", "b/s").replace("Bps", "B/s").replace("bit", "b").replace("yte", "").removesuffix("s/s")
+    )
     if spelled_out in _UNITS:
         return [spelled_out]
     same = [u for u, (d, _) in _UNITS.items() if d == dimension]

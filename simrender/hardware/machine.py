@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator, Sequence
 from functools import cached_property
 
 import simpy
@@ -66,7 +66,9 @@ class MachineCard(Card):
         if distant := self.fabric.distant:
             grouped = sorted(gpu for group in distant.groups for gpu in group)
             if grouped != list(range(self.gpus)):
-                raise ValueError(f"distant.groups must name each GPU from 0 to {self.gpus - 1} once, got {distant.groups}")
+                raise ValueError(
+                    f"distant.groups must name each GPU from 0 to {self.gpus - 1} once, got {distant.groups}"
+                )
         return self
 
     @property
@@ -82,14 +84,14 @@ class MachineCard(Card):
         return "nvlink" if self.nvlink else "pcie"
 
 
-def load_machine(name: str, overrides: list[str] | tuple[str, ...] = ()) -> MachineCard:
+def load_machine(name: str, overrides: Sequence[str] = ()) -> MachineCard:
     """Return a machine's card by name or path.
 
     Parameters
     ----------
     name : str
         ``dgx2``, or the path of a YAML file.
-    overrides : list of str
+    overrides : sequence of str
         ``PATH=VALUE`` without the leading ``machine.``.
 
     Raises
@@ -145,8 +147,8 @@ class Machine:
         """
         fabric = self.card.fabric
         lane = float(fabric.bandwidth)
-        links: dict[str, Link] = {}
-        routes: dict[tuple[int, int], tuple[str, ...]] = {}
+        links: dict[Hashable, Link] = {}
+        routes: dict[tuple[Hashable, Hashable], Sequence[Hashable]] = {}
         for i in range(self.gpus):
             links[f"gpu{i}.out"] = Link(lane, 0.0)
             links[f"gpu{i}.in"] = Link(lane, 0.0)

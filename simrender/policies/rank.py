@@ -221,11 +221,11 @@ class Barrier:
                 self._missing, self._event = self._ranks, self._env.event()
                 delay = closing() - int(self._env.now) if closing else 0
                 if delay:
-                    self._env.timeout(delay).callbacks.append(lambda _: event.succeed())
+                    self._env.timeout(delay).callbacks.append(lambda _: _succeed(event))
                 else:
                     event.succeed()
 
-        waiting = [e for e in after if e.callbacks is not None]
+        waiting = [e for e in after if not e.processed]
         pending = len(waiting)
         for each in waiting:
             each.callbacks.append(ready)
@@ -233,6 +233,15 @@ class Barrier:
             pending = 1
             ready(None)
         return event
+
+
+def _arrival(transfer: simpy.Event) -> int:
+    """Return the tick at which a finished transfer's last byte arrived."""
+    return int(transfer.value or 0)
+
+
+def _succeed(event: simpy.Event) -> None:
+    event.succeed()
 
 
 class Rank:
@@ -289,7 +298,9 @@ class Rank:
         frame.tests += rays.coherent + active
         frame.skipped_tests += skipped
         weight = frame.weight
-        seconds = self._gpu.trace_seconds(rays.coherent * weight, active * weight, frame.partition.primitives[self.domain])
+        seconds = self._gpu.trace_seconds(
+            rays.coherent * weight, active * weight, frame.partition.primitives[self.domain]
+        )
         # A thread whose ray is done reads it and ends.
         seconds += skipped * weight * frame.policy.ray_bytes / self._gpu.card.memory_bandwidth
         begin, end = self._gpu.run(seconds, issued)
@@ -334,7 +345,7 @@ class Rank:
         copy = frame.machine.network.transfer(self.index, to, nbytes, start=begin)
         frame.outbox[to, self._shifts] = rays
         yield from self.synchronize(copy)
-        frame.timeline.add(self.index, COPY, begin, copy.value, nbytes, len(rays) * frame.weight)
+        frame.timeline.add(self.index, COPY, begin, _arrival(copy), nbytes, len(rays) * frame.weight)
         return self._arrived()
 
     def _arrived(self) -> RayQueue:
@@ -361,7 +372,7 @@ class Rank:
         on_the_wire = nbytes / frame.machine.card.fabric.kernel_share
         read = frame.machine.network.transfer(self.left, self.index, on_the_wire, start=begin)
         yield from self.synchronize(read)
-        end = max(end, read.value)
+        end = max(end, _arrival(read))
         self._gpu.hold(end)
         frame.timeline.add(self.index, TRACE, begin, end, nbytes, len(rays) * frame.weight)
         return rays
@@ -382,8 +393,7 @@ class Rank:
 
     def read_own_counter(self, rays: RayQueue) -> Steps:
         """Wait for this rank alone, let the host read its queue counter, and return the number of rays."""
-        for event in self._done():
-            yield event
+        yield self._until(self._gpu.free_at)
         yield self._until(self._host.read_counters(1))
         return len(rays)
 
@@ -423,7 +433,7 @@ class Rank:
         begin = max(self._gpu.free_at, self._host.issue_copy())
         copy = frame.machine.network.transfer(self.index, 0, nbytes, start=begin)
         yield from self.synchronize(copy)
-        frame.timeline.add(self.index, MERGE, begin, copy.value, nbytes, 0.0)
+        frame.timeline.add(self.index, MERGE, begin, _arrival(copy), nbytes, 0.0)
 
     @property
     def samples_weight(self) -> float:

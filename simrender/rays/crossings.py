@@ -82,7 +82,9 @@ class Crossings:
             rows, position = _next_rows(table["first"], table["domain"], table["hit"], begin, count)
             if rows.min() < 0:
                 lost = int(table["ray"][rows.argmin()])
-                raise InvariantError(f"shadow ray {lost} is occluded in the whole scene but in none of its {count} domains")
+                raise InvariantError(
+                    f"shadow ray {lost} is occluded in the whole scene but in none of its {count} domains"
+                )
             unknown = rows[np.isnan(table["hit"][rows])]
             if len(unknown) == 0:
                 break
@@ -116,7 +118,9 @@ class Crossings:
         local = np.flatnonzero((kind == SHADOW) & np.isfinite(t))
         rays = trace.geometry(generation)
         low, high = self.boxes
-        first, domain, entry = _enter_boxes(rays["origin"][local], rays["direction"][local], rays["reach"][local], low, high)
+        first, domain, entry = _enter_boxes(
+            rays["origin"][local], rays["direction"][local], rays["reach"][local], low, high
+        )
         hit = np.full(len(domain), np.nan, np.float32)
         # The whole scene's nearest hit is known, and so is the domain it lies in: one row a ray comes for free.
         primitive = trace.column("primitive")[begin:end][local]

@@ -42,7 +42,7 @@ def read_scene(path: Path) -> Scene:
 
     try:
         loaded: Any = trimesh.load(path, process=False)
-    except Exception as error:  # noqa: BLE001 - trimesh's readers raise whatever their formats provoke
+    except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise SceneError(f"{path}: cannot read this mesh: {reason}") from None
     try:
@@ -62,7 +62,9 @@ def _from_mesh(loaded: Any, path: Path) -> Scene:
 
 
 def _from_graph(graph: Any) -> Scene:
-    objects, materials, index = [], [], {}
+    objects: list[SceneObject] = []
+    materials: list[Material] = []
+    index: dict[str, int] = {}
     for name, geometry in graph.geometry.items():
         if getattr(geometry, "faces", None) is None or len(geometry.faces) == 0:
             continue  # points and lines reflect nothing

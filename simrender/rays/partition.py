@@ -90,7 +90,7 @@ class Partition:
     @cached_property
     def key(self) -> str:
         """Content hash of the assignment."""
-        return hashlib.blake2b(self.domain_of_mesh, digest_size=8).hexdigest() + f"-{self.domains}"
+        return hashlib.blake2b(self.domain_of_mesh.tobytes(), digest_size=8).hexdigest() + f"-{self.domains}"
 
 
 def pieces(scene: Scene, published: Published, footprint: Footprint, split_share: float) -> Pieces:
@@ -127,7 +127,9 @@ def pieces(scene: Scene, published: Published, footprint: Footprint, split_share
             first.append(mesh)
             triangles.append(size * triangle_scale)
             instanced.append(size * float(instances) * instanced_scale)
-            weights.append(triangles[-1] * bytes_a_triangle + float(instances) * instance_scale * footprint.instance_bytes)
+            weights.append(
+                triangles[-1] * bytes_a_triangle + float(instances) * instance_scale * footprint.instance_bytes
+            )
     return Pieces(np.array(first), np.array(triangles), np.array(instanced), np.array(weights))
 
 
@@ -144,7 +146,7 @@ def _runs(sizes: NDArray[np.int64], limit: float) -> list[NDArray[np.int64]]:
     return [*runs, sizes[start:]]
 
 
-def partition(scene: Scene, of: Pieces, domains: int, method: Method = "heaviest_first") -> Partition:
+def partition(of: Pieces, domains: int, method: Method = "heaviest_first") -> Partition:
     """Deal the pieces of a scene to domains.
 
     Heaviest first is greedy: in order of weight, each piece goes to the domain that is least loaded so far (ties to
@@ -152,7 +154,6 @@ def partition(scene: Scene, of: Pieces, domains: int, method: Method = "heaviest
 
     Parameters
     ----------
-    scene : Scene
     of : Pieces
     domains : int
     method : "heaviest_first" or "round_robin"
@@ -171,11 +172,6 @@ def partition(scene: Scene, of: Pieces, domains: int, method: Method = "heaviest
     return Partition(
         domains,
         np.repeat(owner, np.diff(of.first_mesh)).astype(np.int32),
-        np.bincount(owner, of.weight_bytes, minlength=domains),
-        np.bincount(owner, of.instanced_triangles, minlength=domains),
+        np.bincount(owner, of.weight_bytes, minlength=domains).astype(np.float64),
+        np.bincount(owner, of.instanced_triangles, minlength=domains).astype(np.float64),
     )
-
-
-def whole(scene: Scene, of: Pieces) -> Partition:
-    """Return the partition into a single domain."""
-    return partition(scene, of, 1)

@@ -135,7 +135,7 @@ class SceneObject:
 
 @dataclass(frozen=True, eq=False)
 class Triangles:
-    """A scene with every instance written out in world space: what Embree, which embreex offers without instancing, gets.
+    """A scene with every instance written out in world space, because embreex offers no instancing.
 
     Attributes
     ----------
@@ -266,10 +266,10 @@ class Scene:
             digest.update(f"object {len(thing.meshes)}".encode())
             for mesh in thing.meshes:
                 digest.update(f"mesh {mesh.vertices.shape} {mesh.faces.shape} {mesh.material}".encode())
-                digest.update(mesh.vertices)
-                digest.update(mesh.faces)
-        digest.update(self.instance_object)
-        digest.update(self.instance_transform)
+                digest.update(mesh.vertices.data)
+                digest.update(mesh.faces.data)
+        digest.update(self.instance_object.data)
+        digest.update(self.instance_transform.data)
         digest.update(repr((self.materials, self.points, self.environment)).encode())
         return digest.hexdigest()
 

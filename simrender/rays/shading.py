@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from simrender.rays.kinds import CAMERA, DIFFUSE, MIRROR, SHADOW
+from simrender.rays.kinds import DIFFUSE, MIRROR, SHADOW
 from simrender.rays.sampling import cosine_direction, offset_origin, path_key, uniform
 from simrender.rays.scene import Scene
 
@@ -61,11 +61,13 @@ class Surfaces:
         self.sky = np.array([*sky.zenith, *sky.horizon, *sky.ground, *sky.up], dtype=np.float64)
         self.points = np.array([(*p.position, *p.intensity) for p in scene.points], np.float64).reshape(-1, 6)
         # An area light is the set of all triangles of one emissive mesh; a point on it is chosen by area.
-        emits = (self.materials[:, 4:] > 0).any(axis=1)
+        emits = np.any(self.materials[:, 4:] > 0, axis=1)
         self.light_first, self.light_triangles, self.light_area = _area_lights(scene, emits)
 
 
-def _area_lights(scene: Scene, emits: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]:
+def _area_lights(
+    scene: Scene, emits: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]:
     """Return (first triangle of each light, its triangles, the running area within the light)."""
     triangles = scene.triangles
     first, chosen, areas = [0], [], []
@@ -134,7 +136,7 @@ def shade(rays: dict[str, Any], hits: Any, surfaces: Surfaces, bounces: Bounces,
 
     """
     n = len(rays["kind"])
-    out = {
+    out: dict[str, Any] = {
         "origin": np.zeros((2 * n, 3), np.float32),
         "direction": np.zeros((2 * n, 3), np.float32),
         "throughput": np.zeros((2 * n, 3), np.float32),
@@ -145,7 +147,7 @@ def shade(rays: dict[str, Any], hits: Any, surfaces: Surfaces, bounces: Bounces,
     radiance, children = np.zeros((n, 3), np.float32), np.zeros(n, np.uint8)
     spawned = _shade(
         rays["direction"], rays["throughput"], rays["pixel"], rays["sample"], rays["kind"], rays["diffuse"],
-        rays["mirror"], hits.t, hits.primitive, hits.u, hits.v,
+        rays["mirror"], hits.primitive, hits.u, hits.v,
         surfaces.vertices, surfaces.faces, surfaces.material, surfaces.materials, surfaces.sky, surfaces.points,
         surfaces.light_first, surfaces.light_triangles, surfaces.light_area,
         bounces.diffuse, bounces.mirror, bounces.roulette, seed,
@@ -173,7 +175,7 @@ def _sky(sky, dx, dy, dz, channel):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _shade(  # type: ignore[no-untyped-def]
-    direction, throughput, pixel, sample, kind, diffuse_bounces, mirror_bounces, t, primitive, u, v,
+    direction, throughput, pixel, sample, kind, diffuse_bounces, mirror_bounces, primitive, u, v,
     vertices, faces, material_of, materials, sky, points, light_first, light_triangles, light_area,
     most_diffuse, most_mirror, roulette, seed,
     radiance, children, out_origin, out_bits, out_direction, out_throughput, out_reach, out_parent, out_kind,
@@ -213,7 +215,7 @@ def _shade(  # type: ignore[no-untyped-def]
 
         key = path_key(seed, pixel[i], sample[i], 1 + diffuse_bounces[i] + mirror_bounces[i])
         is_mirror = uniform(key, _LOBE) < m[3]
-        if is_mirror and mirror_bounces[i] >= most_mirror or not is_mirror and diffuse_bounces[i] >= most_diffuse:
+        if (is_mirror and mirror_bounces[i] >= most_mirror) or (not is_mirror and diffuse_bounces[i] >= most_diffuse):
             continue
         tr, tg, tb = throughput[i, 0] * m[0], throughput[i, 1] * m[1], throughput[i, 2] * m[2]
         strongest = max(tr, tg, tb)
@@ -257,8 +259,16 @@ def _shade(  # type: ignore[no-untyped-def]
                 lx = w0 * vertices[la, 0] + w1 * vertices[lb, 0] + w2 * vertices[lc, 0]
                 ly = w0 * vertices[la, 1] + w1 * vertices[lb, 1] + w2 * vertices[lc, 1]
                 lz = w0 * vertices[la, 2] + w1 * vertices[lb, 2] + w2 * vertices[lc, 2]
-                gx, gy, gz = vertices[lb, 0] - vertices[la, 0], vertices[lb, 1] - vertices[la, 1], vertices[lb, 2] - vertices[la, 2]
-                hx, hy, hz = vertices[lc, 0] - vertices[la, 0], vertices[lc, 1] - vertices[la, 1], vertices[lc, 2] - vertices[la, 2]
+                gx, gy, gz = (
+                    vertices[lb, 0] - vertices[la, 0],
+                    vertices[lb, 1] - vertices[la, 1],
+                    vertices[lb, 2] - vertices[la, 2],
+                )
+                hx, hy, hz = (
+                    vertices[lc, 0] - vertices[la, 0],
+                    vertices[lc, 1] - vertices[la, 1],
+                    vertices[lc, 2] - vertices[la, 2],
+                )
                 sx, sy, sz = gy * hz - gz * hy, gz * hx - gx * hz, gx * hy - gy * hx
                 size = math.sqrt(sx * sx + sy * sy + sz * sz)
             else:

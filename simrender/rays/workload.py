@@ -227,7 +227,7 @@ class Workload:
             key = (footprint, split_share)
             if key not in self._pieces:
                 self._pieces[key] = pieces(self.scene, self.published, footprint, split_share)
-            self._partitions[facts] = partition(self.scene, self._pieces[key], domains, method)
+            self._partitions[facts] = partition(self._pieces[key], domains, method)
         return self._partitions[facts]
 
     @cached_property
@@ -263,7 +263,9 @@ def load_workload(name: str, overrides: Sequence[str] = (), cache: Path | None =
         path, document, name = found.path, found.document(), found.name
     for override in overrides:
         document.override(WorkloadCard, override, "workload")
-    return Workload(path.stem if given else name, document.validate(WorkloadCard), document.where, path.parent, cache, given)
+    return Workload(
+        path.stem if given else name, document.validate(WorkloadCard), document.where, path.parent, cache, given
+    )
 
 
 def _mesh_card(path: Path, scene: Scene) -> Document:
@@ -286,5 +288,3 @@ camera:
   vertical_fov_degrees: {fov}
 """
     return Document(text, str(path))
-
-

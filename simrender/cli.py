@@ -1,0 +1,337 @@
+"""The command line: thin, and the one place that looks at the clock on the wall.
+
+Results go to stdout; progress, notes and timings to stderr. Exit status: 0 done, 2 a mistake in the input, 3 the model
+does not fit.
+"""
+
+from __future__ import annotations
+
+import sys
+import time  # noqa: TID251 - wall time is measured here, for a person, and never simulated
+import warnings
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from cyclopts import App, CycloptsError, Parameter
+
+from simrender.errors import SimrenderError, UsageError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from simrender.cards import Document
+    from simrender.simulation import Result
+
+app = App(
+    name="simrender",
+    help="How fast would a huge scene render on that machine, under which scheduler, and what holds it back?",
+    version=lambda: metadata.version("simrender-cluster"),
+    version_flags=["--version"],
+)
+
+Set = Annotated[tuple[str, ...], Parameter(name="--set", negative="", show_default=False)]
+Flag = Annotated[Path | None, Parameter(negative="")]
+
+
+@app.command(name="list")
+def list_(kind: Literal["machines", "workloads", "policies"] | None = None, /) -> None:
+    """List what is installed.
+
+    Parameters
+    ----------
+    kind
+        Only machines, workloads or policies.
+
+    """
+    from rich.table import Table
+
+    from simrender import catalog
+
+    for which in ("machines", "workloads", "policies") if kind is None else (kind,):
+        table = Table.grid(padding=(0, 2))
+        if which == "policies":
+            for name in catalog.policies():
+                table.add_row(name, (catalog.find_policy(name).__doc__ or "").splitlines()[0])
+        else:
+            for name, card in catalog.cards("machine" if which == "machines" else "workload").items():
+                table.add_row(name, str(card.document().data.get("title", "")))
+        console = _console()
+        console.print(f"[bold]{which}[/bold]")
+        console.print(table)
+
+
+@app.command
+def show(name: str, /) -> None:
+    """Show a machine's or workload's card with the source of every value, or a policy with its parameters.
+
+    Parameters
+    ----------
+    name
+        Of a machine, a workload or a policy, or the path of a card.
+
+    """
+    from simrender import catalog
+    from simrender.errors import UnknownNameError
+
+    machines, workloads, policies = catalog.cards("machine"), catalog.cards("workload"), catalog.policies()
+    if name in policies:
+        _show_policy(name)
+    elif name in machines or name in workloads:
+        _show_card((machines | workloads)[name].document())
+    elif catalog.looks_like_a_path(name):
+        _show_card(catalog.find_card("machine", name).document())
+    else:
+        raise UnknownNameError("machine, workload or policy", name, [*machines, *workloads, *policies])
+
+
+@app.command
+def trace(
+    workload: str,
+    /,
+    *,
+    set_: Set = (),
+    seed: int = 1,
+    image: Flag = None,
+    cache: Flag = None,
+) -> None:
+    """Trace a workload's rays for real, keep them in the cache, and compare with raw embreex on the same rays.
+
+    Parameters
+    ----------
+    workload
+        Name or path of a card, or path of a mesh file.
+    set_
+        Change a value of the card: PATH=VALUE, where PATH starts with workload.
+    seed
+        Of all random numbers.
+    image
+        Write the picture (.png).
+    cache
+        Folder of the trace cache.
+
+    """
+    from simrender.cards import split_assignments
+    from simrender.rays.workload import load_workload
+    from simrender.report.files import check_target, write_image
+    from simrender.report.tracing import describe_trace, raw_embreex_seconds
+
+    if image:
+        check_target("--image", image, (".png",))
+    sections = split_assignments(set_, ("workload",))
+    begin = time.perf_counter()
+    loaded = load_workload(workload, sections["workload"], cache)
+    rays = loaded.trace(seed)
+    with _Progress() as progress:
+        rays.progress = progress
+        rays.complete()
+    tabled = time.perf_counter() - begin
+    raw = None
+    if rays.traced_rays:
+        tabled, raw = progress.seconds, raw_embreex_seconds(rays, time.perf_counter)
+    _console().print(describe_trace(loaded.name, rays, tabled if rays.traced_rays else None, raw))
+    if image:
+        write_image(image, rays.image())
+        _note(f"wrote {image} ({rays.size[0]}x{rays.size[1]})")
+    _note(f"{time.perf_counter() - begin:.2f} s")
+
+
+@app.command
+def run(
+    machine: str,
+    workload: str,
+    /,
+    *,
+    policy: str | None = None,
+    islands: str = "auto",
+    gpus: int | None = None,
+    set_: Set = (),
+    seed: int = 1,
+    json: Annotated[str | None, Parameter(negative="")] = None,
+    image: Flag = None,
+    timeline: Flag = None,
+    cache: Flag = None,
+) -> int:
+    """Render one frame in simulated time: how fast, with what error, and where the time goes.
+
+    Parameters
+    ----------
+    machine
+        Name or path of a machine's card.
+    workload
+        Name or path of a workload's card, or path of a mesh file (.ply, .obj, .glb, .stl).
+    policy
+        The scheduler; by default the workload's own.
+    islands
+        How many islands, or auto: as many as the fewest GPUs that hold the model allow.
+    gpus
+        Use only so many of the machine's GPUs.
+    set_
+        Change a value of a card: PATH=VALUE, where PATH starts with machine. or workload. or policy.
+    seed
+        Of all random numbers.
+    json
+        Write the result as JSON to a file, or to stdout (-).
+    image
+        Write the picture (.png), at traced size.
+    timeline
+        Write the timeline as a Chrome trace for Perfetto (.json) or as a plot (.png).
+    cache
+        Folder of the trace cache; by default $SIMRENDER_CACHE or ~/.cache/simrender.
+
+    """
+    from simrender.cards import split_assignments
+    from simrender.report.files import check_target, write_image, write_timeline
+    from simrender.simulation import simulate
+
+    if json is not None and json != "-":
+        check_target("--json", Path(json), (".json",))
+    if image:
+        check_target("--image", image, (".png",))
+    if timeline:
+        check_target("--timeline", timeline, (".json", ".png"))
+    count = _islands(islands)
+    begin = time.perf_counter()
+    with _Progress() as progress:
+        result = simulate(
+            machine, workload, policy, islands=count, gpus=gpus, seed=seed,
+            overrides=split_assignments(set_, ("machine", "workload", "policy")), cache=cache, progress=progress,
+        )  # fmt: skip
+    seconds = time.perf_counter() - begin
+    _publish(result, json)
+    if result.image is not None:
+        if image:
+            write_image(image, result.image)
+            _note(f"wrote {image} ({result.image.shape[1]}x{result.image.shape[0]})")
+        if timeline:
+            write_timeline(timeline, result)
+            _note(f"wrote {timeline}")
+    _note(f"simulated in {seconds:.2f} s")
+    return 0 if result.feasible else 3
+
+
+def _publish(result: Result, json: str | None) -> None:
+    if json == "-":
+        import json as encoder
+
+        print(encoder.dumps(result.to_dict(), indent=1))  # noqa: T201 - the result itself
+        return
+    from simrender.report.answer import answer
+
+    _console().print(answer(result))
+    if json:
+        from simrender.report.files import write_json
+
+        write_json(Path(json), result.to_dict())
+        _note(f"wrote {json}")
+
+
+def _islands(text: str) -> int | Literal["auto"]:
+    if text == "auto":
+        return "auto"
+    try:
+        return int(text)
+    except ValueError:
+        raise UsageError(f"--islands {text}: expected a number of islands, or auto") from None
+
+
+def _show_card(document: Document) -> None:
+    from rich.padding import Padding
+    from rich.text import Text
+
+    console = _console()
+    console.print(f"[bold]{document.data.get('title', '')}[/bold]\n[dim]{document.where}[/dim]\n")
+    leaves = _leaves(document.data, ())
+    width = max(len(path) for path, _ in leaves)
+    for path, value in leaves:
+        plain = value if not isinstance(value, dict) else value["value"]
+        line = Text(f"{path:<{width}}  ", style="bold").append(str(plain), style="not bold")
+        if isinstance(value, dict):
+            between = f" ({' to '.join(str(v) for v in value['range'])})" if "range" in value else ""
+            status = value.get("status", "stated")
+            line.append(between, style="not bold")
+            line.append(
+                f"  {status}", style="not bold yellow" if status in {"assumed", "calibrated"} else "not bold green"
+            )
+        console.print(line)
+        if isinstance(value, dict) and value.get("source"):
+            console.print(Padding(Text(value["source"], style="dim"), (0, 0, 0, width + 2)))
+
+
+def _leaves(value: Any, path: tuple[str, ...]) -> list[tuple[str, Any]]:
+    if isinstance(value, dict) and "value" not in value:
+        return [leaf for key, inner in value.items() for leaf in _leaves(inner, (*path, str(key)))]
+    return [(".".join(path), value)]
+
+
+def _show_policy(name: str) -> None:
+    import inspect
+
+    from simrender import catalog
+
+    policy = catalog.find_policy(name)
+    console = _console()
+    console.print(f"[bold]{name}[/bold]\n", highlight=False)
+    console.print(inspect.getdoc(policy) or "", highlight=False, markup=False)
+
+
+class _Progress:
+    """A progress line on stderr while rays are really traced; silent when stderr is no terminal."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._status: Any = None
+        self._begin = 0.0
+
+    def __enter__(self) -> _Progress:
+        return self
+
+    def __call__(self, generation: int, rays: int) -> None:
+        if self._status is None:
+            self._begin = time.perf_counter()
+            self._status = _console(stderr=True).status("")
+            self._status.start()
+        self._status.update(f"tracing bounce {generation}: {rays:,} rays")
+
+    def __exit__(self, *_: object) -> None:
+        if self._status is not None:
+            self.seconds = time.perf_counter() - self._begin
+            self._status.stop()
+
+
+def _console(*, stderr: bool = False) -> Console:
+    from rich.console import Console
+
+    return Console(stderr=stderr, highlight=False, soft_wrap=False)
+
+
+def _note(text: str) -> None:
+    print(text, file=sys.stderr)  # noqa: T201
+
+
+def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
+    _note(f"note: {message}")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run the command line and exit."""
+    warnings.showwarning = _show_warning
+    try:
+        status = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
+    except SimrenderError as error:
+        _note(f"simrender: {error}")
+        sys.exit(2)
+    except CycloptsError as error:
+        _note(f"simrender: {' '.join(str(error).split())}")
+        sys.exit(2)
+    except KeyboardInterrupt:
+        _note("simrender: interrupted; rays traced so far are kept")
+        sys.exit(130)
+    except BrokenPipeError:
+        sys.stderr.close()
+        sys.exit(141)
+    sys.exit(status if isinstance(status, int) else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,100 @@
+"""The answer on a terminal: frame rate, its error, where the time went, and what was left out."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from simrender.units import format_bytes, format_count, format_seconds
+
+if TYPE_CHECKING:
+    from simrender.simulation import Result
+
+_COLORS = {"trace": "green", "shade": "dark_green", "copy": "blue", "wait": "bright_black"}
+_BAR = 48
+
+
+def answer(result: Result) -> RenderableType:
+    """Return what a person wants to know first."""
+    if not result.feasible:
+        return Group(*_infeasible(result))
+    table = Table.grid(padding=(0, 2))
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column()
+    time = result.frame_time_s or 0.0
+    error = result.sampling_error["relative_standard_error"]
+    table.add_row("frame rate", _figure(result.frames_per_s or 0.0, error, "frames/s"))
+    table.add_row("frame time", f"{format_seconds(time)} ± {format_seconds(time * error)} (sampling)")
+    table.add_row("", _calibration(result))
+    table.add_row("islands", _islands(result))
+    table.add_row("memory", _memory(result))
+    table.add_row("where the time went", _bar(result.breakdown))
+    table.add_row("rays", _rays(result))
+    table.add_row("left out", Text("; ".join(item["what"] for item in result.scope["left_out"]), style="dim"))
+    title = Text(f"{result.workload} on {result.machine} under {result.policy}", style="bold underline")
+    return Group(title, table)
+
+
+def _figure(value: float, relative_error: float, unit: str) -> Text:
+    text = Text(f"{value:.3g} {unit}", style="bold")
+    return text.append(f" ± {value * relative_error:.1g} (sampling)", style="not bold")
+
+
+def _calibration(result: Result) -> Text:
+    assumed = sum(1 for v in result.uncalibrated if v["status"] == "assumed")
+    fitted = len(result.uncalibrated) - assumed
+    if not result.uncalibrated:
+        return Text("every input is published, measured or derived")
+    parts = [f"{assumed} assumed"] if assumed else []
+    parts += [f"{fitted} fitted"] if fitted else []
+    return Text(f"not calibrated: hangs on {' and '.join(parts)} values (listed by --json)", style="yellow")
+
+
+def _islands(result: Result) -> str:
+    islands = f"{result.islands} of {result.island_size} GPU{'s' if result.island_size != 1 else ''}"
+    return f"{islands}; {result.unused_gpus} of {result.gpus} GPUs unused" if result.unused_gpus else islands
+
+
+def _memory(result: Result) -> str:
+    m = result.memory
+    needed, capacity, model = (format_bytes(m[f"{key}_bytes"]) for key in ("needed", "capacity", "model"))
+    return f"{needed} of {capacity} on the fullest GPU, {model} of it the model"
+
+
+def _bar(breakdown: dict[str, float]) -> Text:
+    text, drawn, covered = Text(), 0, 0.0
+    for name, share in breakdown.items():
+        covered += share
+        cells = round(covered * _BAR) - drawn
+        drawn += cells
+        text.append("█" * cells, style=_COLORS[name])
+    words = ", ".join(f"{name} {share:.0%}" for name, share in breakdown.items())
+    return text.append(f"\n{words}", style="default")
+
+
+def _rays(result: Result) -> str:
+    c = result.counts
+    return (
+        f"{format_count(c['published_rays'])} a frame; {format_count(c['traced_rays'])} really traced, "
+        f"each for {c['ray_weight']:.3g}"
+    )
+
+
+def _infeasible(result: Result) -> list[Any]:
+    m, needed = result.memory, result.memory["gpus_needed"]
+    need, capacity = format_bytes(m["needed_bytes"]), format_bytes(m["capacity_bytes"])
+    size = f"{result.islands} island{'s' if result.islands != 1 else ''} of {result.island_size} GPUs"
+    lines = [
+        Text(f"{result.workload} does not fit on {result.machine} under {result.policy}", style="bold red"),
+        Text(f"In {size}, the fullest GPU would need {need} and has {capacity}."),
+    ]
+    if needed is None:
+        lines.append(
+            Text("No number of such GPUs would do: every GPU holds the whole model, or one part that cannot be split.")
+        )
+    else:
+        lines.append(Text(f"One island of {needed} such GPUs would hold it."))
+    return lines

@@ -1,0 +1,88 @@
+"""Plots of results, with matplotlib."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from simrender.clock import TICKS_PER_SECOND
+from simrender.timeline import COPIES, KERNELS
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from simrender.simulation import Result
+
+COLORS = {
+    "generate": "#c7c7c7",
+    "trace": "#8fce6a",
+    "copy": "#c9e8b5",
+    "shade": "#2e7d32",
+    "tonemap": "#6d6d6d",
+    "assemble": "#3d3d3d",
+    "merge": "#9ec9e2",
+}
+"""Trace and cycle in light greens, shading in dark green, as in figure 7 of the ray queue cycling paper."""
+
+LABELS = {
+    "generate": "generate",
+    "trace": "trace",
+    "copy": "copy of ray queues",
+    "shade": "shade",
+    "tonemap": "tone-map",
+    "assemble": "assemble",
+    "merge": "copy of pixels",
+}
+
+
+def plot_timeline(result: Result, figure: Figure | None = None) -> Figure:
+    """Draw who did what, when: a row a GPU, idle time in the background colour.
+
+    The layout of figure 7 of the ray queue cycling paper. The figure belongs to no window system and can be made in
+    any thread.
+
+    Parameters
+    ----------
+    result : Result
+        Of a feasible run.
+    figure : matplotlib Figure, optional
+        To draw into; a new one by default.
+
+    """
+    from matplotlib.figure import Figure as NewFigure
+    from matplotlib.patches import Patch
+
+    log = result.spans
+    if log is None:
+        raise ValueError("an infeasible run has no timeline")
+    figure = figure or NewFigure(figsize=(10.0, 1.3 + 0.32 * log.gpus), layout="constrained")
+    axes = figure.subplots()
+    axes.set_facecolor("#f4f4ef")
+    device, kind = np.array(log.device), np.array(log.kind)
+    start, end = (np.array(t, dtype=float) / TICKS_PER_SECOND * 1e3 for t in (log.start, log.end))
+    legend: list[Any] = []
+    for k, name in enumerate(KERNELS + COPIES):
+        chosen = kind == k
+        if not chosen.any():
+            continue
+        for gpu in range(log.gpus):
+            rows = chosen & (device == gpu)
+            spans = list(zip(start[rows], end[rows] - start[rows], strict=True))
+            # Without edges and smoothing, thousands of thin spans add up to the colour of their share.
+            axes.broken_barh(spans, (gpu - 0.4, 0.8), facecolors=COLORS[name], edgecolor="none", linewidth=0)
+        share = float((end - start)[chosen].sum()) / (log.gpus * (result.frame_time_s or 1.0) * 1e3)
+        if share >= 0.0005:
+            legend.append(Patch(facecolor=COLORS[name], label=f"{LABELS[name]} ({share:.1%})"))
+    idle = result.breakdown.get("wait", 0.0)
+    legend.append(Patch(facecolor="#f4f4ef", edgecolor="#bbbbbb", label=f"idle ({idle:.1%})"))
+    axes.set_yticks(range(log.gpus), [f"GPU {i}" for i in range(log.gpus)])
+    axes.set_ylim(log.gpus - 0.5, -0.5)
+    axes.set_xlim(0.0, (result.frame_time_s or 0.0) * 1e3)
+    axes.set_xlabel("time in the frame [ms]")
+    axes.tick_params(axis="y", length=0)
+    axes.spines[["top", "right", "left"]].set_visible(False)
+    islands = f"{result.islands} island{'s' if result.islands != 1 else ''} of {result.island_size}"
+    axes.set_title(f"{result.workload} on {result.machine}, {result.policy}, {islands}", fontsize=10)
+    figure.legend(handles=legend, loc="outside lower center", ncols=min(6, len(legend)), frameon=False, fontsize=8)
+    return figure
