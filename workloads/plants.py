@@ -144,30 +144,32 @@ def assemble(name: str, parts: Iterable[tuple[int, Part]]) -> SceneObject:
 
 
 def _foliage(
-    rng: np.random.Generator, centre: F64, radii: F64, leaves: int, tones: Sequence[int], *, cover: float = 1.1, slim: float = 0.42
+    rng: np.random.Generator, centre: F64, radii: F64, leaves: int, tones: Sequence[int]
 ) -> list[tuple[int, Part]]:
     """Return leaves on the upper shells of ellipsoidal clumps (n, 3), dark tones first: below, inside and by chance."""
     clump = rng.choice(len(centre), leaves, p=radii.prod(axis=1) ** (2 / 3) / (radii.prod(axis=1) ** (2 / 3)).sum())
     outward = unit(rng.normal(size=(leaves, 3)) + np.array([0.0, 0.0, 0.25]))
-    depth = rng.uniform(0.72, 1.05, leaves)
+    depth = rng.uniform(0.74, 1.04, leaves)
     root = centre[clump] + radii[clump] * outward * depth[:, None]
-    normal = unit(outward + 0.45 * rng.normal(size=(leaves, 3)))
+    normal = unit(outward + 0.32 * rng.normal(size=(leaves, 3)))
     forward = unit(np.cross(normal, rng.normal(size=(leaves, 3))) - np.array([0.0, 0.0, 0.35]))
     area = float((radii[:, 0] * radii[:, 1] + 2.0 * radii[:, 0] * radii[:, 2]).sum()) * 4.2
+    slim, cover = 0.36, 0.8 + 0.5 * np.exp(-leaves / 400.0)  # many leaves also cover by lying behind each other
     length = np.sqrt(cover * area / (leaves * 2.0 * slim)) * rng.uniform(0.75, 1.25, leaves)
     low, high = centre[:, 2].min() - radii[:, 2].max(), centre[:, 2].max() + radii[:, 2].max()
-    light = (root[:, 2] - low) / (high - low) * 0.7 + (depth - 0.72) * 0.9 + rng.uniform(-0.18, 0.18, leaves)
+    light = (root[:, 2] - low) / (high - low) * 0.7 + (depth - 0.74) * 0.9 + rng.uniform(-0.18, 0.18, leaves)
     tone = np.clip(light * len(tones), 0, len(tones) - 1).astype(np.int64)
     parts = []
     for index, material in enumerate(tones):
         k = tone == index
-        parts.append((material, fronds(root[k], forward[k], normal[k], length[k], slim * length[k], sweep=0.0)))
+        start = root[k] - 0.5 * length[k, None] * forward[k]
+        parts.append((material, fronds(start, forward[k], normal[k], length[k], slim * length[k], sweep=0.0)))
     return parts
 
 
 def broadleaf(
     seed: int, name: str, *, triangles: int, height: float, bark: int, leaves: Sequence[int],
-    spread: float = 0.34, bare: float = 0.28, cover: float = 1.1,
+    spread: float = 0.34, bare: float = 0.28,
 ) -> SceneObject:  # fmt: skip
     """Build a tree of branches with clumps of leaves at their ends.
 
@@ -186,12 +188,10 @@ def broadleaf(
         Radius of the crown in heights.
     bare : float
         Height of the trunk below the crown, in heights.
-    cover : float
-        Area of the leaves over the area of the crown's surface.
 
     """
     rng = generator(seed, name)
-    limbs = int(np.clip(triangles / 90, 3, 22))
+    limbs = int(np.clip(triangles / 60, 4, 26))
     sides = int(np.clip(triangles / 300, 3, 7))
     crown = np.array([spread, spread, 0.5 * (1.0 - bare)]) * height
     middle = np.array([0.0, 0.0, height - crown[2]])
@@ -217,11 +217,11 @@ def broadleaf(
         paths = np.stack([start, bend, centre], axis=1)
         parts.append((bark, tubes(paths, np.broadcast_to(taper, (limbs, 3)), max(3, sides - 2))))
     left = max(triangles - sum(len(part[1]) for _, part in parts), 24)
-    return assemble(name, parts + _foliage(rng, centre, radii, left // 2, leaves, cover=cover))
+    return assemble(name, parts + _foliage(rng, centre, radii, left // 2, leaves))
 
 
 def conifer(
-    seed: int, name: str, *, triangles: int, height: float, bark: int, leaves: Sequence[int], spread: float = 0.2
+    seed: int, name: str, *, triangles: int, height: float, bark: int, leaves: Sequence[int], spread: float = 0.22
 ) -> SceneObject:
     """Build a spruce: whorls of drooping branches, shorter towards the top; parameters as in `broadleaf`."""
     rng = generator(seed, name)
@@ -231,13 +231,13 @@ def conifer(
     leaflets = max(1, round((triangles / 110.0) ** 0.6))
     count = max((triangles - 4 * sides) // (2 * leaflets), 8)
     rise = 1.0 - (np.arange(count) + 0.5) / count
-    at = 1.0 - 0.9 * rise**0.62 + rng.uniform(-0.012, 0.012, count)
+    at = np.minimum(1.0 - 0.92 * rise**0.95 + rng.uniform(-0.012, 0.012, count), 1.0)
     angle = GOLDEN_ANGLE * np.arange(count) + rng.uniform(-0.2, 0.2, count)
     pitch = -0.28 + 0.75 * at**2 + rng.uniform(-0.08, 0.08, count)
     forward = unit(np.stack([np.cos(angle), np.sin(angle), pitch], axis=1))
-    length = height * (spread * (1.0 - at) ** 0.85 * rng.uniform(0.8, 1.15, count) + 0.012)
+    length = height * (spread * (1.0 - at) ** 0.85 * rng.uniform(0.8, 1.15, count) + 0.022)
     root = np.stack([np.zeros(count), np.zeros(count), at * height], axis=1)
-    width = length * (0.3 if leaflets > 2 else 0.5)
+    width = length * np.interp(leaflets, [1, 3, 6], [0.5, 0.42, 0.34])
     tone = np.clip((at * 0.6 + rng.uniform(0.0, 0.6, count)) * len(leaves), 0, len(leaves) - 1).astype(np.int64)
     for index, material in enumerate(leaves):
         k = tone == index
@@ -266,7 +266,7 @@ def palm(
         for angle in 2.1 * np.arange(4):
             vertices, faces = blob(rng, (0.15, 0.15, 0.18), 24, 0.02)
             parts.append((fruit, (vertices + crown + 0.26 * np.array([np.cos(angle), np.sin(angle), -0.9]), faces)))
-    count = int(np.clip(triangles / 60, 8, 24))
+    count = int(np.clip(triangles / 45, 9, 28))
     left = max(triangles - sum(len(part[1]) for _, part in parts), 2 * count)
     leaflets = max(1, left // (2 * count))
     age = (np.arange(count) + 0.5) / count  # the youngest fronds stand upright, the oldest hang
@@ -274,7 +274,7 @@ def palm(
     pitch = np.interp(age, [0.0, 0.3, 1.0], [1.9, 0.65, -0.3]) + rng.uniform(-0.1, 0.1, count)
     forward = unit(np.stack([np.cos(angle), np.sin(angle), pitch], axis=1))
     length = (1.5 + 0.24 * height) * rng.uniform(0.88, 1.1, count)
-    width = length * (0.2 if leaflets > 5 else 0.12)
+    width = length * (0.22 if leaflets > 5 else 0.14)
     droop = 0.3 + 0.35 * age
     tone = ((1.0 - age) * len(leaves)).astype(np.int64)
     for index, material in enumerate(leaves):
@@ -296,7 +296,7 @@ def shrub(
     centre = rng.normal(size=(clumps, 3)) * np.array([0.2, 0.2, 0.06]) * size + np.array([0.0, 0.0, 0.25 * size])
     radii = size * rng.uniform(0.24, 0.36, (clumps, 1)) * np.array([1.0, 1.0, 0.8])
     blooms = triangles // 12 if blossom is not None else 0
-    parts = _foliage(rng, centre, radii, max(triangles // 2 - blooms, 6), leaves, cover=1.25)
+    parts = _foliage(rng, centre, radii, max(triangles // 2 - blooms, 6), leaves)
     if blossom is not None:
         k = rng.integers(0, clumps, blooms)
         outward = unit(rng.normal(size=(blooms, 3)) + np.array([0.0, 0.0, 0.6]))
@@ -391,7 +391,7 @@ def rock(seed: int, name: str, *, triangles: int, size: float, stone: int, flat:
 def log(seed: int, name: str, *, triangles: int, size: float, bark: int) -> SceneObject:
     """Build a fallen trunk ``size`` metres long with a few broken branches."""
     rng = generator(seed, name)
-    sides = int(np.clip(triangles / 14, 4, 14))
+    sides = int(np.clip(triangles / 10, 4, 14))
     x = np.linspace(-0.5, 0.5, 5) * size
     path = np.stack([x, 0.03 * size * np.sin(3.0 * x / size), np.full(5, 0.05 * size)], axis=1)
     thick = 0.06 * size * np.array([0.02, 1.0, 0.92, 0.8, 0.02])

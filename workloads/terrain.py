@@ -10,7 +10,7 @@ processor's sine differs from another's is rounded away.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,8 @@ from simrender.rays.scene import F32, I32, Mesh, SceneObject
 F64 = NDArray[np.float64]
 I64 = NDArray[np.int64]
 Suitability = Callable[[F64, F64, F64, F64], F64]  # (x, y, height, slope) -> weight of growing there, 0 for never
+
+Placed = tuple[SceneObject, F32]  # an object and the transforms (n, 3, 4) of its instances
 
 LATTICE = 64
 
@@ -97,7 +99,7 @@ def tiles(points: F64, material: I64, across: tuple[int, int]) -> tuple[Mesh, ..
 
     """
     rows, columns = material.shape[:2]
-    cuts = [np.unique(np.linspace(0, n, min(t, n) + 1).astype(np.int64)) for n, t in zip((rows, columns), across, strict=True)]
+    cuts = [np.linspace(0, n, min(t, n) + 1).astype(np.int64) for n, t in zip((rows, columns), across, strict=True)]
     meshes = []
     for r0, r1 in zip(cuts[0][:-1], cuts[0][1:], strict=True):
         for c0, c1 in zip(cuts[1][:-1], cuts[1][1:], strict=True):
@@ -172,8 +174,60 @@ class Terrain:
         return i, j, (corner, *rise), u, v
 
 
+@dataclass(frozen=True)
+class Kind:
+    """A species, and where how many of it grow.
+
+    Attributes
+    ----------
+    name : str
+        Names its random streams too, so that adding a kind leaves the others where they are.
+    build : callable
+        Called with seed, name, ``triangles`` and the shape: one of the builders of `workloads.plants`.
+    triangles : int
+    count : int
+        Number of instances.
+    suits : callable
+        Weight of growing at points of the terrain, from their x, y, height and slope; 0 for never.
+    within : (x low, x high, y low, y high)
+        Where to look for places at all.
+    shape : mapping
+        The builder's other arguments.
+    scale : (float, float)
+        Lowest and highest scale of an instance.
+    sink : float
+        Depth of the object's origin in the ground, in metres before scaling; see `stand`.
+
+    """
+
+    name: str
+    build: Callable[..., SceneObject]
+    triangles: int
+    count: int
+    suits: Suitability
+    within: tuple[float, float, float, float]
+    shape: Mapping[str, object]
+    scale: tuple[float, float] = (0.7, 1.3)
+    sink: float = 0.05
+
+
+def grow(seed: int, detail: float, terrain: Terrain, kinds: Sequence[Kind]) -> list[Placed]:
+    """Build each kind and place its instances, with triangles and counts scaled by ``detail``.
+
+    A kind for which no place suits is left out; any other has at least one instance.
+    """
+    placed = []
+    for kind in kinds:
+        rng = generator(seed, f"places of {kind.name}")
+        x, y = scatter(rng, terrain, max(1, round(kind.count * detail)), kind.suits, kind.within)
+        if len(x):
+            thing = kind.build(seed, kind.name, triangles=max(8, round(kind.triangles * detail)), **kind.shape)
+            placed.append((thing, stand(rng, terrain, x, y, scale=kind.scale, sink=kind.sink)))
+    return placed
+
+
 def scatter(
-    rng: np.random.Generator, terrain: Terrain, count: int, suits: Suitability, within: tuple[float, float, float, float]
+    rng: np.random.Generator, terrain: Terrain, count: int, suits: Suitability, within: tuple[float, ...]
 ) -> tuple[F64, F64]:
     """Draw places for instances by suitability, without replacement, from a jittered grid that keeps them apart.
 
@@ -207,7 +261,7 @@ def scatter(
 
 
 def stand(
-    rng: np.random.Generator, terrain: Terrain, x: F64, y: F64, scale: tuple[float, float] = (0.7, 1.3), sink: float = 0.0
+    rng: np.random.Generator, terrain: Terrain, x: F64, y: F64, *, scale: tuple[float, float] = (0.7, 1.3), sink: float = 0.0
 ) -> F32:
     """Return transforms that stand an object upright on the ground, turned about z and scaled at random.
 
@@ -238,7 +292,7 @@ def stand(
     return transform.astype(np.float32)
 
 
-def instances(placed: Sequence[tuple[SceneObject, F32]]) -> tuple[tuple[SceneObject, ...], I32, F32]:
+def instances(placed: Sequence[Placed]) -> tuple[tuple[SceneObject, ...], I32, F32]:
     """Return the objects, the object of each instance and its transform, as `Scene` takes them."""
     things = tuple(thing for thing, _ in placed)
     counts = [len(transform) for _, transform in placed]

@@ -163,7 +163,6 @@ class Frame:
 
     def __post_init__(self) -> None:
         self.barrier = Barrier(self.env, self.layout.ranks)
-        self._counts: dict[int, tuple[int, int]] = {}
         self._visits: list[NDArray[np.int16]] = []
         self._joined: NDArray[np.int16] = np.zeros(0, np.int16)
 
@@ -192,46 +191,59 @@ class Frame:
 
 
 class Barrier:
-    """All ranks wait until the last has arrived; then an optional closing step may take a while."""
+    """All ranks wait until the last has arrived; each then gets what all of them brought.
+
+    What they brought is handed out when the last arrives, not looked up when a rank goes on: by then a faster one may
+    have arrived at the next barrier already.
+    """
 
     def __init__(self, env: simpy.Environment, ranks: int) -> None:
         self._env, self._ranks = env, ranks
-        self._missing, self._event = ranks, env.event()
+        self._begin()
 
-    def arrive(self, after: list[simpy.Event], closing: Callable[[], int] | None = None) -> simpy.Event:
+    def _begin(self) -> None:
+        self._missing, self._event = self._ranks, self._env.event()
+        self._brought: list[Any] = [None] * self._ranks
+
+    def arrive(
+        self, rank: int, after: list[simpy.Event], bring: Any = None, closing: Callable[[], int] | None = None
+    ) -> simpy.Event:
         """Announce a rank that is ready when all the given events have happened; return what it must wait for.
 
         Parameters
         ----------
+        rank : int
         after : list of Event
+        bring : object, optional
+            The event's value is the list of what each rank brought.
         closing : callable, optional
             Called when the last rank is ready; returns the tick at which they all go on.
 
         """
-        event = self._event
-        pending = len(after)
+        event, brought = self._event, self._brought
+        brought[rank] = bring
+        waiting = [e for e in after if not e.processed]
+        pending = len(waiting)
 
-        def ready(_: simpy.Event | None) -> None:
+        def ready(_: simpy.Event | None = None) -> None:
             nonlocal pending
             pending -= 1
             if pending > 0:
                 return
             self._missing -= 1
-            if self._missing == 0:
-                self._missing, self._event = self._ranks, self._env.event()
-                delay = closing() - int(self._env.now) if closing else 0
-                if delay:
-                    self._env.timeout(delay).callbacks.append(lambda _: _succeed(event))
-                else:
-                    event.succeed()
+            if self._missing > 0:
+                return
+            self._begin()
+            delay = closing() - int(self._env.now) if closing else 0
+            if delay:
+                self._env.timeout(delay).callbacks.append(lambda _: _succeed(event, brought))
+            else:
+                event.succeed(brought)
 
-        waiting = [e for e in after if not e.processed]
-        pending = len(waiting)
         for each in waiting:
             each.callbacks.append(ready)
         if not waiting:
-            pending = 1
-            ready(None)
+            ready()
         return event
 
 
@@ -240,8 +252,8 @@ def _arrival(transfer: simpy.Event) -> int:
     return int(transfer.value or 0)
 
 
-def _succeed(event: simpy.Event) -> None:
-    event.succeed()
+def _succeed(event: simpy.Event, value: Any) -> None:
+    event.succeed(value)
 
 
 class Rank:
@@ -288,9 +300,11 @@ class Rank:
 
     def trace(self, rays: RayQueue) -> None:
         """Trace a queue against this rank's domain; shadow rays already known to be occluded are skipped."""
-        self._trace(rays, self._host.issue_launch(), 0.0)
+        begin, end, looking = self._trace(rays)
+        self._frame.timeline.add(self.index, TRACE, begin, end, 0.0, looking)
 
-    def _trace(self, rays: RayQueue, issued: int, nbytes: float) -> tuple[int, int]:
+    def _trace(self, rays: RayQueue) -> tuple[int, int, float]:
+        """Run the trace kernel; return when it begins and ends, and the published rays that really looked for a hit."""
         frame = self._frame
         active = rays.active(frame)
         skipped = rays.incoherent - active
@@ -303,10 +317,8 @@ class Rank:
         )
         # A thread whose ray is done reads it and ends.
         seconds += skipped * weight * frame.policy.ray_bytes / self._gpu.card.memory_bandwidth
-        begin, end = self._gpu.run(seconds, issued)
-        if not nbytes:
-            frame.timeline.add(self.index, TRACE, begin, end, 0.0, (rays.coherent + active) * weight)
-        return begin, end
+        begin, end = self._gpu.run(seconds, self._host.issue_launch())
+        return begin, end, (rays.coherent + active) * weight
 
     def shade(self, rays: RayQueue) -> RayQueue:
         """Shade the rays, add what they contribute to this rank's pixels, and return the rays they spawn."""
@@ -368,28 +380,30 @@ class Rank:
         yield from self.synchronize()
         rays = self._arrived()
         nbytes = len(rays) * frame.policy.ray_bytes * frame.weight
-        begin, end = self._trace(rays, self._host.issue_launch(), nbytes)
+        begin, end, looking = self._trace(rays)
         on_the_wire = nbytes / frame.machine.card.fabric.kernel_share
         read = frame.machine.network.transfer(self.left, self.index, on_the_wire, start=begin)
         yield from self.synchronize(read)
         end = max(end, _arrival(read))
         self._gpu.hold(end)
-        frame.timeline.add(self.index, TRACE, begin, end, nbytes, len(rays) * frame.weight)
+        frame.timeline.add(self.index, TRACE, begin, end, nbytes, looking)
         return rays
 
     # -- waiting --------------------------------------------------------------------------------------------------
 
     def synchronize(self, *events: simpy.Event) -> Steps:
         """Wait until every rank's kernels, and the given copies, are done."""
-        yield self._frame.barrier.arrive(self._done(*events))
+        yield self._frame.barrier.arrive(self.index, self._done(*events))
 
     def read_counters(self, rays: RayQueue) -> Steps:
         """Wait for all ranks, let the host read their queue counters, and return them as `Counts`."""
         frame = self._frame
-        frame._counts[self.index] = (len(rays) - rays.shadows, rays.shadows)
-        yield frame.barrier.arrive(self._done(), lambda: frame.machine.host.read_counters(frame.layout.ranks))
-        by_rank = [frame._counts[i] for i in range(frame.layout.ranks)]
-        return Counts([p for p, _ in by_rank], [s for _, s in by_rank], [len(p) for p in frame.pixels_of])
+        mine = (len(rays) - rays.shadows, rays.shadows, len(self._pixels))
+        all_read = frame.barrier.arrive(
+            self.index, self._done(), mine, lambda: frame.machine.host.read_counters(frame.layout.ranks)
+        )
+        by_rank = yield all_read
+        return Counts(*(list(column) for column in zip(*by_rank, strict=True)))
 
     def read_own_counter(self, rays: RayQueue) -> Steps:
         """Wait for this rank alone, let the host read its queue counter, and return the number of rays."""

@@ -50,9 +50,10 @@ class Store:
         """Return the arrays stored under a name, or None if there are none or they are damaged."""
         path = self.folder / f"{name}.npz"
         try:
-            with np.load(path, allow_pickle=False) as archive:
+            # Opened here and not by np.load, which leaves a damaged file open.
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
                 return {column: archive[column] for column in archive.files}
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zipfile.LargeZipFile) as error:
             self._warn(f"the cache file {path} is damaged ({error}); it is discarded and computed again")
