@@ -38,7 +38,9 @@ def test_sixteen_gpus_without_islands(benchmark, workload):
 
 def test_a_second_policy_on_a_cached_trace(benchmark, tmp_path):
     """Image parallelism after ray queue cycling: no more than 0.15 of the first run's time."""
-    simulate("dgx2", load_workload("landscape", ["traced.resolution=64x27"], tmp_path), islands=2)  # compiles the kernels
+    simulate(
+        "dgx2", load_workload("landscape", ["traced.resolution=64x27"], tmp_path), islands=2
+    )  # compiles the kernels
     fresh = load_workload("landscape", cache=tmp_path)
     begin = time.perf_counter()
     simulate("dgx2", fresh, "ray_queue_cycling", islands=2)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import types
 import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -26,6 +27,17 @@ from simrender.errors import CardError, UnitError, UsageError, did_you_mean
 
 Status = Literal["published", "measured", "derived", "assumed", "calibrated", "stated"]
 """Where a value comes from; ``stated`` is a plain value, whose card vouches for it as a whole."""
+
+_EXPECTED: Final = {
+    "int": "a whole number",
+    "float": "a number",
+    "bool": "true or false",
+    "string": "text",
+    "list": "a list",
+    "tuple": "a list",
+    "dict": "a mapping of names to values",
+}
+"""What pydantic's kinds of mistakes begin with, and what was expected then."""
 
 UNCALIBRATED: Final = ("assumed", "calibrated")
 """The statuses that a result has to own up to."""
@@ -93,7 +105,7 @@ class _Reads:
         return value
 
     def _plain(self, text: Any) -> Quantity:
-        return text if isinstance(text, Quantity) else Quantity(self._number(text), str(text))
+        return text if isinstance(text, Quantity) else Quantity(self._number(text), written(text))
 
     def _with_provenance(self, fields: dict[str, Any]) -> Quantity:
         value, text = fields["value"]
@@ -104,7 +116,7 @@ class _Reads:
         return Quantity(value, text, fields.get("status", "stated"), fields.get("source", ""), between)
 
     def __get_pydantic_core_schema__(self, _source: Any, _handler: GetCoreSchemaHandler) -> CoreSchema:
-        number = core_schema.no_info_plain_validator_function(lambda text: (self._number(text), str(text)))
+        number = core_schema.no_info_plain_validator_function(lambda text: (self._number(text), written(text)))
         field = core_schema.typed_dict_field
         statuses = list(typing.get_args(Status))
         fields = core_schema.typed_dict_schema(
@@ -156,6 +168,24 @@ def _quantities(value: Any, path: str) -> Iterator[tuple[str, Quantity]]:
             yield from _quantities(item, f"{path}.{i}")
 
 
+class _Loader(yaml.SafeLoader):
+    """Reads plain data, with the plain scalars of YAML 1.2.
+
+    PyYAML follows YAML 1.1, in which ``no`` is false, ``1:30`` is 90, ``010`` is 8 and ``1e9`` is text. Here only
+    ``true`` and ``false`` are truth values, ``1e9`` is a number, and what is neither is text, dates included.
+    """
+
+
+_Loader.yaml_implicit_resolvers = {}
+for _tag, _pattern in {
+    "bool": r"true|True|TRUE|false|False|FALSE",
+    "int": r"[-+]?(?:0|[1-9]\d*)",
+    "float": r"[-+]?(?:\d+\.\d*|\.\d+|\d+(?=[eE]))(?:[eE][-+]?\d+)?|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
+    "null": r"~|null|Null|NULL|",
+}.items():
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(rf"(?:{_pattern})\Z", re.ASCII), None)
+
+
 class Document:
     """A parsed YAML mapping that knows where each of its values was written.
 
@@ -178,36 +208,59 @@ class Document:
         self.positions: dict[Path, str] = {}
         self.keys: dict[Path, str] = {}
         self._mistakes: list[str] = []
+        self._open: set[yaml.Node] = set()
         try:
-            node = yaml.compose(text, yaml.SafeLoader)
+            node = yaml.compose(text, _Loader)
         except yaml.MarkedYAMLError as error:
             mark = error.problem_mark
             at = f"{where}:{mark.line + 1}:{mark.column + 1}" if mark else where
-            raise CardError([f"{at}: not valid YAML: {error.problem}"]) from None
+            problem = error.problem or ""
+            if problem.startswith("but "):  # the second half of a sentence
+                problem = f"{error.context}, {problem}"
+            raise CardError([f"{at}: not valid YAML: {problem}"]) from None
         except yaml.YAMLError as error:
             raise CardError([f"{where}: not valid YAML: {' '.join(str(error).split())}"]) from None
+        except RecursionError:
+            raise CardError([f"{where}: not valid YAML: nested too deeply"]) from None
         if not isinstance(node, yaml.MappingNode):
             got = "nothing" if node is None else "a list" if isinstance(node, yaml.SequenceNode) else "a single value"
             raise CardError([f"{where}:1:1: a card is a mapping of fields, got {got}"])
-        self._loader = yaml.SafeLoader("")
+        self._loader = _Loader("")
         self.data: dict[str, Any] = self._construct(node, ())
         if self._mistakes:
             raise CardError(self._mistakes)
 
     def _construct(self, node: yaml.Node, path: Path) -> Any:
         self.positions.setdefault(path, self._at(node))
+        if node in self._open:
+            self._mistake(node, path, "this value contains itself")
+            return None
+        self._open.add(node)
+        value: Any = None
         if isinstance(node, yaml.MappingNode):
-            mapping: dict[Any, Any] = {}
+            value = {}
             for key_node, value_node in node.value:
-                key = self._loader.construct_object(key_node, deep=True)
-                if key in mapping:
-                    self._mistakes.append(f"{self._at(key_node)}: {dotted((*path, key))}: this field stands twice")
+                if not isinstance(key_node, yaml.ScalarNode):
+                    self._mistake(key_node, path, "the name of a field is a word, got a list or a mapping")
+                    continue
+                key = key_node.value
+                if key in value:
+                    self._mistake(key_node, (*path, key), "this field stands twice")
                 self.keys[(*path, key)] = self._at(key_node)
-                mapping[key] = self._construct(value_node, (*path, key))
-            return mapping
-        if isinstance(node, yaml.SequenceNode):
-            return [self._construct(item, (*path, i)) for i, item in enumerate(node.value)]
-        return self._loader.construct_object(node, deep=True)
+                value[key] = self._construct(value_node, (*path, key))
+        elif isinstance(node, yaml.SequenceNode):
+            value = [self._construct(item, (*path, i)) for i, item in enumerate(node.value)]
+        else:
+            try:
+                value = self._loader.construct_object(node, deep=True)
+            except (yaml.YAMLError, ValueError):
+                tag = node.tag.replace("tag:yaml.org,2002:", "!!")
+                self._mistake(node, path, f"cannot read {_clipped(node.value)} as {tag}")
+        self._open.remove(node)
+        return value
+
+    def _mistake(self, node: yaml.Node, path: Path, message: str) -> None:
+        self._mistakes.append(": ".join([self._at(node), *([dotted(path)] if path else []), message]))
 
     def _at(self, node: yaml.Node) -> str:
         return f"{self.where}:{node.start_mark.line + 1}:{node.start_mark.column + 1}"
@@ -238,7 +291,7 @@ class Document:
         """
         dotted_path, _, text = assignment.partition("=")
         spelled = f"--set {section}.{dotted_path}"
-        parts: Path = tuple(int(p) if p.isdigit() else p for p in dotted_path.split("."))
+        parts: Path = tuple(int(p) if re.fullmatch("[0-9]+", p) else p for p in dotted_path.split("."))
         target: Any = self.data
         shape: Any = model
         for depth, part in enumerate(parts):
@@ -248,34 +301,58 @@ class Document:
                 raise CardError(
                     [f"{spelled}: {here} has no field {str(part)!r}{suggestion} (it has: {', '.join(known)})"]
                 )
-            shape = known[str(part)] if known is not None else _item_type(shape, part)
+            if not isinstance(target, (dict, list)):
+                raise CardError([f"{spelled}: {here} is a single value, without parts"])
+            if isinstance(target, list) and (not isinstance(part, int) or part >= len(target)):
+                span = f"a list of {len(target)}, whose parts are 0 to {len(target) - 1}"
+                raise CardError([f"{spelled}: {here} is {span if target else 'an empty list'}"])
+            default, shape = _default(shape, part), known[str(part)] if known is not None else _item_type(shape, part)
             if shape is None:
                 raise CardError([f"{spelled}: {here} is a single value, without parts"])
             if depth == len(parts) - 1:
                 break
-            target = target.get(part) if isinstance(target, dict) else _at_index(target, part)
-            if not isinstance(target, (dict, list)):
+            if isinstance(target, dict) and default is not None:
+                target.setdefault(part, default)
+            target = target.get(part) if isinstance(target, dict) else target[int(part)]
+            if target is None:
                 twins = [dotted((section, *p)) for p in self.keys if p[-1] == parts[-1]]
                 hint = f"; did you mean {', '.join(twins)}?" if twins else ""
                 raise CardError([f"{spelled}: {self.where} has no {dotted((section, *parts[: depth + 1]))}{hint}"])
         try:
-            value = yaml.safe_load(text)
-        except yaml.YAMLError:
+            value = yaml.load(text, _Loader)  # noqa: S506 - a safe loader
+        except (yaml.YAMLError, ValueError):
             value = text  # let the field say what it expects
         self.positions = {p: at for p, at in self.positions.items() if p[: len(parts)] != parts}
         self.positions[parts] = self.keys[parts] = f"--set {section}."
         target[parts[-1]] = value
+
+    def _has(self, path: Path) -> bool:
+        value: Any = self.data
+        for part in path:
+            if not (part in value if isinstance(value, dict) else isinstance(value, list) and isinstance(part, int)):
+                return False
+            value = value[part]
+        return True
 
     def validate(self, model: type[T]) -> T:
         """Return the document as the given pydantic model or dataclass, or raise every mistake at once."""
         try:
             return TypeAdapter(model).validate_python(self.data)
         except ValidationError as error:
-            raise CardError([self._explain(e, model) for e in error.errors(include_url=False)]) from None
+            # Each branch of a union complains, in the same words.
+            mistakes = dict.fromkeys(self._explain(e, model) for e in error.errors(include_url=False))
+            raise CardError(sorted(mistakes, key=self._place)) from None
+
+    def _place(self, mistake: str) -> tuple[float, float]:
+        """Return line and column of a mistake; those of a ``--set`` come last."""
+        found = re.match(r":(\d+):(\d+):", mistake.removeprefix(self.where))
+        return (int(found[1]), int(found[2])) if found else (math.inf, math.inf)
 
     def _explain(self, error: Any, model: type[Any]) -> str:
         path: Path = tuple(p for p in error["loc"] if not (isinstance(p, str) and p.startswith("<")))
-        message, kind, given = error["msg"], error["type"], error.get("input")
+        message, kind, given = error["msg"], error["type"], _clipped(error.get("input"))
+        if kind not in {"missing", "missing_argument"} and not self._has(path):
+            path, kind = path[:-1], "union"  # the last part names a branch
         position = self.position(path)
         if kind in {"extra_forbidden", "unexpected_keyword_argument"}:
             known = _fields_at(model, path[:-1])
@@ -286,18 +363,35 @@ class Document:
         elif kind == "literal_error":
             expected = error["ctx"]["expected"]
             choices = [c.strip("' ") for c in expected.replace(" or ", ", ").split(",")]
-            message = f"expected {expected}, got {given!r}{did_you_mean(str(given), choices)}"
+            message = f"expected {expected}, got {given}{did_you_mean(str(error['input']), choices)}"
         elif kind in {"model_type", "model_attributes_type", "dataclass_type"}:
-            message = f"expected a section with the fields {', '.join(_fields_at(model, path))}, got {given!r}"
+            message = f"expected a section with the fields {', '.join(_fields_at(model, path))}, got {given}"
         elif kind == "value_error":
             message = message.removeprefix("Value error, ")
+        elif kind == "union":
+            message = f"expected a single value, got {given}"
+        elif kind == "too_long":
+            message = f"expected {error['ctx']['max_length']} values, got {given}"
+        elif expected := next((words for start, words in _EXPECTED.items() if kind.startswith(start)), None):
+            message = f"expected {expected}, got {given}"
         elif kind != "quantity":
-            message = f"{message.removeprefix('Input ')}, got {given!r}"
-        return (
-            f"{position}{dotted(path)}: {message}"
-            if position.endswith(".")
-            else f"{position}: {dotted(path)}: {message}"
-        )
+            message = f"{message.removeprefix('Input ')}, got {given}"
+        if position.endswith("."):  # of a --set
+            return f"{position}{dotted(path)}: {message}"
+        return f"{position}: {dotted(path)}: {message}" if path else f"{position}: {message}"
+
+
+def _clipped(value: Any) -> str:
+    text = "nothing" if value is None else written(value) if isinstance(value, float) else repr(value)
+    return text if len(text) <= 80 else f"{text[:79]}…"
+
+
+def written(value: Any) -> str:
+    """Return a card's value as a person writes it: ``1e9`` and ``true``, not ``1000000000.0`` and ``True``."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    mantissa, e, exponent = f"{value:g}".partition("e") if isinstance(value, float) else ("", "", "")
+    return f"{mantissa}e{int(exponent)}" if e and float(f"{mantissa}e{exponent}") == value else str(value)
 
 
 def dotted(path: Iterable[str | int]) -> str:
@@ -335,8 +429,13 @@ def _item_type(shape: Any, part: str | int) -> Any:
     return None
 
 
-def _at_index(target: Any, part: str | int) -> Any:
-    return target[part] if isinstance(target, list) and isinstance(part, int) and part < len(target) else None
+def _default(shape: Any, part: str | int) -> dict[str, Any] | None:
+    """Return what stands for a section that a card may leave out, or None if it then has no such section."""
+    shape = _without_optional(shape)
+    if not (isinstance(shape, type) and issubclass(shape, BaseModel)):
+        return None
+    default = shape.model_fields[str(part)].get_default(call_default_factory=True, validated_data={})
+    return {} if isinstance(default, BaseModel) else dict(default) if isinstance(default, dict) else None
 
 
 def _fields_at(model: Any, path: Path) -> list[str]:

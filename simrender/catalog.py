@@ -14,12 +14,15 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from simrender.cards import Document
 from simrender.errors import CardError, UnknownNameError, UsageError
 
 Kind = Literal["machine", "workload"]
+
+CARD_ENDINGS: Final = (".yaml", ".yml", "")
+"""Endings of card files; a pipe has none."""
 
 
 @dataclass(frozen=True)
@@ -49,8 +52,8 @@ class CardFile:
 def cards(kind: Kind) -> dict[str, CardFile]:
     """Return every installed card of a kind by name, sorted.
 
-    A package that cannot be imported is skipped with a warning: someone else's broken plug-in must not take the
-    program down.
+    A package that cannot be imported, for whatever reason, is skipped with a warning: someone else's broken plug-in
+    must not take the program down.
 
     Raises
     ------
@@ -61,11 +64,11 @@ def cards(kind: Kind) -> dict[str, CardFile]:
     found: dict[str, CardFile] = {}
     for entry in importlib.metadata.entry_points(group=f"simrender.{kind}s"):
         try:
-            package = importlib.import_module(entry.value)
-        except ImportError as error:
-            warnings.warn(f"{kind}s of {entry.value!r} are left out: {error}", stacklevel=2)
+            folders = importlib.import_module(entry.value).__path__
+        except Exception as error:
+            warnings.warn(f"{kind}s of {entry.value!r} are left out: {_reason(error)}", stacklevel=2)
             continue
-        for folder in package.__path__:
+        for folder in folders:
             for path in sorted(Path(folder).glob("*/card.yaml")):
                 name = path.parent.name.replace("_", "-")
                 if name in found and found[name].path != path:
@@ -81,10 +84,17 @@ def find_card(kind: Kind, name: str) -> CardFile:
     ------
     UnknownNameError
         If there is neither, with the nearest name.
+    UsageError
+        If the path is that of something else than a card.
 
     """
     if looks_like_a_path(name):
         path = Path(name)
+        if path.is_dir():
+            raise UsageError(f"{name}: this is a folder, expected the card of a {kind}, such as {path / 'card.yaml'}")
+        if path.suffix.lower() not in CARD_ENDINGS:
+            mesh = "; a mesh ends in .ply, .obj, .glb, .gltf or .stl" if kind == "workload" else ""
+            raise UsageError(f"{name}: expected the card of a {kind}, a file that ends in .yaml or .yml{mesh}")
         if not path.is_file():
             raise UnknownNameError(kind, name, cards(kind), "there is no such file either")
         return CardFile(path.stem if path.stem != "card" else path.resolve().parent.name, path)
@@ -116,13 +126,22 @@ def find_policy(name: str) -> type[Any]:
     ------
     UnknownNameError
         If there is none, with the nearest name.
+    UsageError
+        If somebody's package brings one that cannot be imported.
 
     """
     known = policies()
     if name not in known:
         raise UnknownNameError("policy", name, known)
-    policy: type[Any] = known[name].load()
+    try:
+        policy: type[Any] = known[name].load()
+    except Exception as error:
+        raise UsageError(f"the policy {name!r} ({known[name].value}) cannot be loaded: {_reason(error)}") from None
     return policy
+
+
+def _reason(error: Exception) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
 
 
 def load_function(reference: str, where: str) -> Callable[..., Any]:
@@ -137,6 +156,6 @@ def load_function(reference: str, where: str) -> Callable[..., Any]:
     module, _, name = reference.partition(":")
     try:
         function: Callable[..., Any] = getattr(importlib.import_module(module), name)
-    except (ImportError, AttributeError, ValueError) as error:
+    except (ImportError, AttributeError, TypeError, ValueError) as error:
         raise CardError([f"{where}: cannot load {reference!r} (written as package.module:function): {error}"]) from None
     return function

@@ -6,14 +6,16 @@ does not fit.
 
 from __future__ import annotations
 
+import re
 import sys
 import time  # noqa: TID251 - wall time is measured here, for a person, and never simulated
 import warnings
+from collections.abc import Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from cyclopts import App, CycloptsError, Parameter
+from cyclopts import App, CycloptsError, Parameter, Token, UnusedCliTokensError
 
 from simrender.errors import SimrenderError, UsageError
 
@@ -30,8 +32,21 @@ app = App(
     version_flags=["--version"],
 )
 
+
+def _whole(_type: Any, tokens: Sequence[Token]) -> int:
+    """Read a whole number; cyclopts itself would take 2.5 for 2."""
+    keyword, text = tokens[0].keyword, tokens[0].value
+    if not re.fullmatch(r"[-+]?[0-9]{1,18}", text):
+        raise UsageError(f"{keyword} {text}: expected a whole number{' of up to 18 digits' if text.isdigit() else ''}")
+    return int(text)
+
+
+MOST_DOMAINS = 1024
+"""Rows that `simrender trace --domains` will print."""
+
 Set = Annotated[tuple[str, ...], Parameter(name="--set", negative="", show_default=False)]
 Flag = Annotated[Path | None, Parameter(negative="")]
+Whole = Annotated[int, Parameter(converter=_whole)]
 
 
 @app.command(name="list")
@@ -45,17 +60,27 @@ def list_(kind: Literal["machines", "workloads", "policies"] | None = None, /) -
 
     """
     from rich.table import Table
+    from rich.text import Text
 
     from simrender import catalog
 
+    def title(name: str, card: catalog.CardFile | None) -> str:
+        try:
+            if card is not None:
+                return str(card.document().data.get("title", ""))
+            return (catalog.find_policy(name).__doc__ or "").partition("\n")[0]
+        except SimrenderError as error:  # one broken card or plug-in hides no other
+            warnings.warn(str(error), stacklevel=2)
+            return "broken"
+
     for which in ("machines", "workloads", "policies") if kind is None else (kind,):
         table = Table.grid(padding=(0, 2))
-        if which == "policies":
-            for name in catalog.policies():
-                table.add_row(name, (catalog.find_policy(name).__doc__ or "").splitlines()[0])
-        else:
-            for name, card in catalog.cards("machine" if which == "machines" else "workload").items():
-                table.add_row(name, str(card.document().data.get("title", "")))
+        found: dict[str, catalog.CardFile | None] = (
+            dict.fromkeys(catalog.policies()) if which == "policies"
+            else {**catalog.cards("machine" if which == "machines" else "workload")}
+        )  # fmt: skip
+        for name, card in found.items():
+            table.add_row(name, Text(title(name, card)))
         console = _console()
         console.print(f"[bold]{which}[/bold]")
         console.print(table)
@@ -79,7 +104,7 @@ def show(name: str, /) -> None:
         _show_policy(name)
     elif name in machines or name in workloads:
         _show_card((machines | workloads)[name].document())
-    elif catalog.looks_like_a_path(name):
+    elif Path(name).is_file():
         _show_card(catalog.find_card("machine", name).document())
     else:
         raise UnknownNameError("machine, workload or policy", name, [*machines, *workloads, *policies])
@@ -90,8 +115,9 @@ def trace(
     workload: str,
     /,
     *,
+    domains: Whole = 8,
     set_: Set = (),
-    seed: int = 1,
+    seed: Whole = 1,
     image: Flag = None,
     cache: Flag = None,
 ) -> None:
@@ -101,6 +127,8 @@ def trace(
     ----------
     workload
         Name or path of a card, or path of a mesh file.
+    domains
+        Say what would lie in each domain of an object partition into so many.
     set_
         Change a value of the card: PATH=VALUE, where PATH starts with workload.
     seed
@@ -114,10 +142,13 @@ def trace(
     from simrender.cards import split_assignments
     from simrender.rays.workload import load_workload
     from simrender.report.files import check_target, write_image
-    from simrender.report.tracing import describe_trace, raw_embreex_seconds
+    from simrender.report.tracing import describe_domains, describe_rays, describe_speed
 
     if image:
         check_target("--image", image, (".png",))
+    _check_seed(seed)
+    if not 1 <= domains <= MOST_DOMAINS:
+        raise UsageError(f"--domains {domains}: expected 1 to {MOST_DOMAINS}")
     sections = split_assignments(set_, ("workload",))
     begin = time.perf_counter()
     loaded = load_workload(workload, sections["workload"], cache)
@@ -125,15 +156,14 @@ def trace(
     with _Progress() as progress:
         rays.progress = progress
         rays.complete()
-    tabled = time.perf_counter() - begin
-    raw = None
-    if rays.traced_rays:
-        tabled, raw = progress.seconds, raw_embreex_seconds(rays, time.perf_counter)
-    _console().print(describe_trace(loaded.name, rays, tabled if rays.traced_rays else None, raw))
+    console = _console()
+    console.print(describe_rays(loaded.name, rays))
+    console.print(describe_domains(loaded, rays, domains))
+    console.print(describe_speed(rays, progress.seconds, time.perf_counter))
     if image:
         write_image(image, rays.image())
         _note(f"wrote {image} ({rays.size[0]}x{rays.size[1]})")
-    _note(f"{time.perf_counter() - begin:.2f} s")
+    _note(f"done in {time.perf_counter() - begin:.2f} s")
 
 
 @app.command
@@ -144,9 +174,9 @@ def run(
     *,
     policy: str | None = None,
     islands: str = "auto",
-    gpus: int | None = None,
+    gpus: Whole | None = None,
     set_: Set = (),
-    seed: int = 1,
+    seed: Whole = 1,
     json: Annotated[str | None, Parameter(negative="")] = None,
     image: Flag = None,
     timeline: Flag = None,
@@ -190,6 +220,10 @@ def run(
         check_target("--image", image, (".png",))
     if timeline:
         check_target("--timeline", timeline, (".json", ".png"))
+    targets = [path.resolve() for path in (Path(json or "-"), image, timeline) if path]
+    if len(set(targets)) < len(targets):
+        raise UsageError("--json, --image and --timeline: two of them name the same file")
+    _check_seed(seed)
     count = _islands(islands)
     begin = time.perf_counter()
     with _Progress() as progress:
@@ -235,27 +269,36 @@ def _islands(text: str) -> int | Literal["auto"]:
         raise UsageError(f"--islands {text}: expected a number of islands, or auto") from None
 
 
+def _check_seed(seed: int) -> None:
+    if seed < 0:
+        raise UsageError(f"--seed {seed}: a seed is not negative")
+
+
 def _show_card(document: Document) -> None:
     from rich.padding import Padding
     from rich.text import Text
 
+    from simrender.cards import written
+
     console = _console()
-    console.print(f"[bold]{document.data.get('title', '')}[/bold]\n[dim]{document.where}[/dim]\n")
+    title = Text(str(document.data.get("title", "")), style="bold")
+    console.print(title, Text(f"{document.where}\n", style="dim"), sep="\n")
     leaves = _leaves(document.data, ())
-    width = max(len(path) for path, _ in leaves)
+    width = max((len(path) for path, _ in leaves), default=0)
     for path, value in leaves:
         plain = value if not isinstance(value, dict) else value["value"]
-        line = Text(f"{path:<{width}}  ", style="bold").append(str(plain), style="not bold")
+        line = Text(f"{path:<{width}}  ", style="bold").append(written(plain), style="not bold")
         if isinstance(value, dict):
-            between = f" ({' to '.join(str(v) for v in value['range'])})" if "range" in value else ""
-            status = value.get("status", "stated")
+            bounds = value.get("range")
+            between = f" ({' to '.join(written(v) for v in bounds)})" if isinstance(bounds, list) else ""
+            status = str(value.get("status", "stated"))
             line.append(between, style="not bold")
             line.append(
                 f"  {status}", style="not bold yellow" if status in {"assumed", "calibrated"} else "not bold green"
             )
         console.print(line)
         if isinstance(value, dict) and value.get("source"):
-            console.print(Padding(Text(value["source"], style="dim"), (0, 0, 0, width + 2)))
+            console.print(Padding(Text(str(value["source"]), style="dim"), (0, 0, 0, width + 2)))
 
 
 def _leaves(value: Any, path: tuple[str, ...]) -> list[tuple[str, Any]]:
@@ -276,27 +319,33 @@ def _show_policy(name: str) -> None:
 
 
 class _Progress:
-    """A progress line on stderr while rays are really traced; silent when stderr is no terminal."""
+    """A progress bar on stderr while rays are really traced; silent when stderr is no terminal."""
 
     def __init__(self) -> None:
         self.seconds = 0.0
-        self._status: Any = None
+        self._bar: Any = None
+        self._task: Any = None
         self._begin = 0.0
 
     def __enter__(self) -> _Progress:
         return self
 
-    def __call__(self, generation: int, rays: int) -> None:
-        if self._status is None:
+    def __call__(self, generation: int, done: int, rays: int) -> None:
+        if self._bar is None:
+            from rich.progress import Progress
+
+            self._bar = Progress(console=_console(stderr=True), transient=True)
+            self._bar.start()
+            self._task = self._bar.add_task("")
             self._begin = time.perf_counter()
-            self._status = _console(stderr=True).status("")
-            self._status.start()
-        self._status.update(f"tracing bounce {generation}: {rays:,} rays")
+        self.seconds = time.perf_counter() - self._begin
+        self._bar.update(
+            self._task, description=f"tracing bounce {generation}, {rays:,} rays", completed=done, total=rays
+        )
 
     def __exit__(self, *_: object) -> None:
-        if self._status is not None:
-            self.seconds = time.perf_counter() - self._begin
-            self._status.stop()
+        if self._bar is not None:
+            self._bar.stop()
 
 
 def _console(*, stderr: bool = False) -> Console:
@@ -316,10 +365,18 @@ def _show_warning(message: Warning | str, *_: object, **__: object) -> None:
 def main(arguments: list[str] | None = None) -> None:
     """Run the command line and exit."""
     warnings.showwarning = _show_warning
+    tokens = list(sys.argv[1:] if arguments is None else arguments)
+    for i in range(len(tokens) - 1, 0, -1):
+        if tokens[i - 1 : i + 1] == ["--json", "-"]:  # cyclopts takes a lone hyphen for an option
+            tokens[i - 1 : i + 1] = ["--json=-"]
     try:
-        status = app(arguments, exit_on_error=False, print_error=False, result_action="return_value")
+        status = app(tokens, exit_on_error=False, print_error=False, result_action="return_value")
     except SimrenderError as error:
         _note(f"simrender: {error}")
+        sys.exit(2)
+    except UnusedCliTokensError as error:
+        extra = (error.unused_tokens or [""])[0]
+        _note(f"simrender: unexpected argument {extra!r}{'; each --set takes one PATH=VALUE' if '=' in extra else ''}")
         sys.exit(2)
     except CycloptsError as error:
         _note(f"simrender: {' '.join(str(error).split())}")
@@ -330,6 +387,12 @@ def main(arguments: list[str] | None = None) -> None:
     except BrokenPipeError:
         sys.stderr.close()
         sys.exit(141)
+    except MemoryError as error:
+        _note(f"simrender: out of memory: {error}; a smaller workload.traced.resolution needs less")
+        sys.exit(2)
+    except OSError as error:  # a full disk, a name that is too long
+        _note(f"simrender: {error.filename or 'the operating system'}: {error.strerror or error}")
+        sys.exit(2)
     sys.exit(status if isinstance(status, int) else 0)
 
 

@@ -14,6 +14,9 @@ from simrender.errors import ScheduleError
 TICKS_PER_SECOND = 10**12
 """One tick is a picosecond."""
 
+_NOISE = 4.0 * 2.0**-53
+"""Relative: half a unit in the last place each of a duration and of its product, with as much to spare."""
+
 
 def to_ticks(seconds: float) -> int:
     """Return a duration in ticks, rounded up, so that nothing ever ends before it could have.
@@ -31,7 +34,10 @@ def to_ticks(seconds: float) -> int:
     """
     if not 0.0 <= seconds < math.inf:
         raise ScheduleError(f"a duration must be finite and not negative, got {seconds!r} s")
-    return math.ceil(seconds * TICKS_PER_SECOND)
+    ticks = seconds * TICKS_PER_SECOND
+    whole = round(ticks)
+    # 0.1 us is 100000 ticks: what two roundings of a float add is no time, and would break ties.
+    return whole if math.isclose(ticks, whole, rel_tol=_NOISE, abs_tol=0.0) else math.ceil(ticks)
 
 
 def to_seconds(ticks: int) -> float:

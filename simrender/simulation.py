@@ -147,7 +147,7 @@ def simulate(
     cache : Path, optional
         Folder of the trace cache; by default ``$SIMRENDER_CACHE`` or ``~/.cache/simrender``.
     progress : callable, optional
-        Called with (generation, rays) before rays are really traced.
+        Called with (generation, rays traced, rays in it) while rays are really traced.
 
     Returns
     -------

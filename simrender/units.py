@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import re
+from fractions import Fraction
 from typing import Final
 
 from simrender.errors import UnitError, did_you_mean
@@ -44,6 +45,7 @@ def _table() -> dict[str, tuple[str, float]]:
         units[f"{prefix}ray"] = (RAYS, factor)
         units[f"{prefix}ray/s"] = (RAYS_PER_SECOND, factor)
     units.update({s: (SECONDS, f) for s, f in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("µs", 1e-6), ("ns", 1e-9))})
+    units["\u03bcs"] = units["µs"]  # the Greek letter, which looks the same
     units["ps"] = (SECONDS, 1e-12)
     units["%"] = (NUMBER, 0.01)
     return units
@@ -51,7 +53,7 @@ def _table() -> dict[str, tuple[str, float]]:
 
 _UNITS: Final = _table()
 _QUANTITY: Final = re.compile(
-    r"\s*([-+]?(?:\d[\d_]*\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf)\b)\s*(.*?)\s*", re.I
+    r"\s*([-+]?(?:\d+(?:_\d+)*\.?\d*|\.\d+)(?:[eE][-+]?\d+)?|[-+]?(?:nan|inf)\b)\s*(.*?)\s*", re.I
 )
 
 
@@ -61,7 +63,7 @@ def describe(dimension: str) -> str:
     return f"{name} such as {example}"
 
 
-def parse(text: str | float, dimension: str) -> float:
+def parse(text: object, dimension: str) -> float:
     """Read a quantity of the given dimension and return it in SI units.
 
     Parameters
@@ -79,43 +81,49 @@ def parse(text: str | float, dimension: str) -> float:
     """
     expected = f"expected {describe(dimension)}"
     if isinstance(text, bool) or not isinstance(text, (str, int, float)):
-        raise UnitError(f"{expected}, got {text!r}")
+        raise UnitError(f"{expected}, got {'nothing' if text is None else repr(text)}")
     if not isinstance(text, str):
         if dimension != NUMBER:
             raise UnitError(f"{expected}, got the number {text!r} without a unit")
-        return _finite(float(text), expected)
+        return _finite(text, expected)
     match = _QUANTITY.fullmatch(text)
     if match is None:
         raise UnitError(f"{expected}, got {text!r}")
-    number, unit = float(match[1].replace("_", "")), match[2]
+    number, unit = float(match[1]), match[2]
     if unit == "":
         if dimension != NUMBER:
             raise UnitError(f"{expected}, got {text!r} without a unit")
         return _finite(number, expected)
     if unit not in _UNITS:
-        raise UnitError(f"unknown unit {unit!r}{did_you_mean(unit, _candidates(unit, dimension))} ({expected})")
+        raise UnitError(f"unknown unit {unit!r}{_suggestion(unit, dimension)} ({expected})")
     found, factor = _UNITS[unit]
     if found != dimension:
         raise UnitError(f"{expected}, got {_EXAMPLES[found][0]}: {text!r}")
-    # Dividing by 1e6 rounds correctly where multiplying by 1e-6 would not: 2.5 us is 2.5e-6 s to the last bit.
-    return _finite(number * factor if factor >= 1.0 else number / round(1.0 / factor), expected)
+    _finite(number, expected)
+    exact = Fraction(match[1]) if number else Fraction(0)
+    # In fractions, because 0.1 us is 1e-7 s to the last bit, and 0.1 / 1e6 is not.
+    return _finite(exact * Fraction(factor) if factor >= 1.0 else exact / round(1.0 / factor), expected)
 
 
-def _finite(value: float, expected: str) -> float:
+def _finite(number: float | Fraction, expected: str) -> float:
+    try:
+        value = float(number)
+    except OverflowError:  # hundreds of digits
+        value = math.inf
     if not math.isfinite(value):
         raise UnitError(f"{expected}, got {value}, which is not a finite number")
     return value
 
 
-def _candidates(unit: str, dimension: str) -> list[str]:
-    """Return the units worth suggesting for an unknown one: those of the expected dimension first."""
-    spelled_out = (
-        unit.replace("bps", "b/s").replace("Bps", "B/s").replace("bit", "b").replace("yte", "").removesuffix("s/s")
-    )
-    if spelled_out in _UNITS:
-        return [spelled_out]
-    same = [u for u, (d, _) in _UNITS.items() if d == dimension]
-    return same or list(_UNITS)
+def _suggestion(unit: str, dimension: str) -> str:
+    """Return which unit was probably meant: the same one spelled out, or the nearest of the expected dimension."""
+    short = unit.replace("bps", "b/s").replace("Bps", "B/s")
+    for word, symbol in (("[Bb]ytes?", "B"), ("[Bb]its?", "b"), ("sec(ond)?s?", "s"), ("rays", "ray")):
+        short = re.sub(word, symbol, short)
+    meant = [spelled for spelled in (short, f"{unit}B") if spelled in _UNITS]
+    if meant:
+        return f"; did you mean {meant[0]!r}?"
+    return did_you_mean(unit, [u for u, (d, _) in _UNITS.items() if d == dimension])
 
 
 def format_bytes(value: float) -> str:
@@ -126,8 +134,8 @@ def format_bytes(value: float) -> str:
 def format_seconds(value: float) -> str:
     """Return a duration for a person: ``"345 ms"``, ``"2.5 us"``."""
     for unit, factor in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)):
-        if value >= factor or unit == "ns":
-            return f"{value / factor:.3g} {unit}"
+        if value >= 0.9995 * factor or unit == "ns":
+            return f"{_three_digits(value / factor)} {unit}"
     raise AssertionError("unreachable")
 
 
@@ -137,8 +145,12 @@ def format_count(value: float) -> str:
 
 
 def _format(value: float, unit: str, base: float) -> str:
-    for prefix in ("", "k", "M", "G", "T"):
-        if abs(value) < 999.5 or prefix == "T":
-            return f"{value:.3g} {prefix}{unit}".rstrip()
+    for prefix in ("", "k", "M", "G", "T", "P"):
+        if abs(value) < 999.5 or prefix == "P":
+            return f"{_three_digits(value)} {prefix}{unit}".rstrip()
         value /= base
     raise AssertionError("unreachable")
+
+
+def _three_digits(value: float) -> str:
+    return f"{value:.3g}" if abs(value) < 999.5 else f"{value:.0f}"

@@ -49,10 +49,11 @@ def test_the_same_run_gives_the_same_log_and_another_seed_another(garden):
 
 
 def test_hashes_do_not_depend_on_the_process(tmp_path):
-    script = (
-        "from tests.scenes import garden_workload; from simrender import simulate; from pathlib import Path; import sys;"
-        "r = simulate('dgx2', garden_workload(cache=Path(sys.argv[1])), islands=2); print(r.image_sha256, r.event_log_sha256)"
-    )
+    script = """
+import sys; from pathlib import Path; from simrender import simulate; from tests.scenes import garden_workload
+result = simulate("dgx2", garden_workload(cache=Path(sys.argv[1])), islands=2)
+print(result.image_sha256, result.event_log_sha256)
+"""
     seen = {
         subprocess.run(
             [sys.executable, "-c", script, str(tmp_path / seed)],
@@ -61,7 +62,7 @@ def test_hashes_do_not_depend_on_the_process(tmp_path):
             capture_output=True,
             text=True,
             check=True,
-        ).stdout  # fmt: skip
+        ).stdout
         for seed in ("1", "2")
     }
     assert len(seen) == 1

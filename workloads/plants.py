@@ -154,7 +154,7 @@ def _foliage(
     normal = unit(outward + 0.32 * rng.normal(size=(leaves, 3)))
     forward = unit(np.cross(normal, rng.normal(size=(leaves, 3))) - np.array([0.0, 0.0, 0.35]))
     area = float((radii[:, 0] * radii[:, 1] + 2.0 * radii[:, 0] * radii[:, 2]).sum()) * 4.2
-    slim, cover = 0.36, 0.8 + 0.5 * np.exp(-leaves / 400.0)  # many leaves also cover by lying behind each other
+    slim, cover = 0.36, 0.38 + 0.9 * np.exp(-leaves / 500.0)  # many leaves also cover by lying behind each other
     length = np.sqrt(cover * area / (leaves * 2.0 * slim)) * rng.uniform(0.75, 1.25, leaves)
     low, high = centre[:, 2].min() - radii[:, 2].max(), centre[:, 2].max() + radii[:, 2].max()
     light = (root[:, 2] - low) / (high - low) * 0.7 + (depth - 0.74) * 0.9 + rng.uniform(-0.18, 0.18, leaves)
@@ -231,11 +231,11 @@ def conifer(
     leaflets = max(1, round((triangles / 110.0) ** 0.6))
     count = max((triangles - 4 * sides) // (2 * leaflets), 8)
     rise = 1.0 - (np.arange(count) + 0.5) / count
-    at = np.minimum(1.0 - 0.92 * rise**0.95 + rng.uniform(-0.012, 0.012, count), 1.0)
+    at = np.minimum(1.0 - 0.92 * rise**1.08 + rng.uniform(-0.012, 0.012, count), 1.0)
     angle = GOLDEN_ANGLE * np.arange(count) + rng.uniform(-0.2, 0.2, count)
     pitch = -0.28 + 0.75 * at**2 + rng.uniform(-0.08, 0.08, count)
     forward = unit(np.stack([np.cos(angle), np.sin(angle), pitch], axis=1))
-    length = height * (spread * (1.0 - at) ** 0.85 * rng.uniform(0.8, 1.15, count) + 0.022)
+    length = height * (spread * (1.0 - at) ** 0.85 * rng.uniform(0.8, 1.15, count) + 0.03)
     root = np.stack([np.zeros(count), np.zeros(count), at * height], axis=1)
     width = length * np.interp(leaflets, [1, 3, 6], [0.5, 0.42, 0.34])
     tone = np.clip((at * 0.6 + rng.uniform(0.0, 0.6, count)) * len(leaves), 0, len(leaves) - 1).astype(np.int64)
@@ -397,6 +397,6 @@ def log(seed: int, name: str, *, triangles: int, size: float, bark: int) -> Scen
     thick = 0.06 * size * np.array([0.02, 1.0, 0.92, 0.8, 0.02])
     path[0, 0], path[4, 0] = path[1, 0] - 0.02 * size, path[3, 0] + 0.02 * size
     start = path[rng.integers(1, 4, 3)]
-    end = start + 0.25 * size * unit(rng.normal(size=(3, 3)) * np.array([0.5, 1.0, 0.3]) + np.array([0.0, 0.0, 0.7]))
+    end = start + 0.16 * size * unit(rng.normal(size=(3, 3)) * np.array([0.6, 1.0, 0.2]) + np.array([0.5, 0.0, 0.35]))
     stubs = tubes(np.stack([start, end], axis=1), np.broadcast_to(0.02 * size * np.array([1.0, 0.4]), (3, 2)), 3)
     return assemble(name, [(bark, tubes(path[None], thick[None], sides)), (bark, stubs)])

@@ -159,7 +159,6 @@ class Frame:
     retired: list[Ids] = field(default_factory=list)
     tests: float = 0.0
     skipped_tests: float = 0.0
-    generations: int = 0
 
     def __post_init__(self) -> None:
         self.barrier = Barrier(self.env, self.layout.ranks)
@@ -329,8 +328,7 @@ class Rank:
             raise InvariantError(f"rank {self.index} shades rays of rank {rays.home}")
         frame.retired.append(rays.ids)
         spawned = frame.queue(frame.trace.children(rays.ids), self.index)
-        pixels = len(rays) - rays.shadows
-        nbytes = (len(rays) + len(spawned)) * frame.policy.ray_bytes + (pixels + rays.shadows) * ACCUMULATED_BYTES
+        nbytes = (len(rays) + len(spawned)) * frame.policy.ray_bytes + len(rays) * ACCUMULATED_BYTES
         self._kernel(SHADE, nbytes, len(rays))
         return spawned
 
@@ -427,7 +425,7 @@ class Rank:
         """Tone-map this rank's pixels, copy them to rank 0, and let rank 0 put them in order (section 4.8)."""
         frame = self._frame
         pixels = len(self._pixels)
-        real = pixels * self.samples_weight
+        real = pixels * frame.weight
         seconds = self._gpu.stream_seconds(real * (ACCUMULATED_BYTES + PIXEL_BYTES))
         begin, end = self._gpu.run(seconds, self._host.issue_launch())
         frame.timeline.add(self.index, TONEMAP, begin, end, real * (ACCUMULATED_BYTES + PIXEL_BYTES), 0.0)
@@ -448,9 +446,3 @@ class Rank:
         copy = frame.machine.network.transfer(self.index, 0, nbytes, start=begin)
         yield from self.synchronize(copy)
         frame.timeline.add(self.index, MERGE, begin, _arrival(copy), nbytes, 0.0)
-
-    @property
-    def samples_weight(self) -> float:
-        """Published pixels for which a traced pixel stands."""
-        frame = self._frame
-        return frame.published[0] * frame.published[1] / frame.trace.pixels

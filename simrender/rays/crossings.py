@@ -175,7 +175,7 @@ class Crossings:
         return low, high
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _enters(ox, oy, oz, dx, dy, dz, reach, low, high):  # type: ignore[no-untyped-def]
     """Return where a ray enters a box, or -1 if it does not; generous by a few float32 roundings.
 
@@ -198,7 +198,7 @@ def _enters(ox, oy, oz, dx, dy, dz, reach, low, high):  # type: ignore[no-untype
     return near if near <= far * (1.0 + 1e-6) else -1.0
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _enter_boxes(origin, direction, reach, low, high):  # type: ignore[no-untyped-def]
     """Return the crossings of rays with boxes: (first row of each ray, box, entry), front to back within a ray."""
     n, boxes = len(reach), len(low)
@@ -233,7 +233,7 @@ def _enter_boxes(origin, direction, reach, low, high):  # type: ignore[no-untype
     return first, domain, entry
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _next_rows(first, domain, hit, begin, domains):  # type: ignore[no-untyped-def]
     """Return, for each ray, the first row around the ring that is not known to miss, and its position (0 = start)."""
     n = len(first) - 1

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ I32 = NDArray[np.int32]
 A = TypeVar("A")
 B = TypeVar("B")
 
-CHUNK = 1 << 15
+CHUNK = 1 << 14
 """Rays a thread takes at once: small enough to stay in its cache, large enough to hide Python."""
 
 
@@ -77,15 +77,28 @@ class Geometry:
             How far each ray goes; not changed.
 
         """
-        found = self._scene.run(origins, directions, dists=reach.copy(), query="INTERSECT", output=True)
-        primitive = found["primID"]
-        t = np.where(primitive < 0, np.float32(np.inf), found["tfar"])
+        found = self.raw(origins, directions, reach)
+        t, primitive = found["tfar"], found["primID"]
+        t[primitive < 0] = np.inf
         return Hits(t, primitive, found["u"], found["v"])
 
+    def raw(self, origins: F32, directions: F32, reach: F32) -> dict[str, Any]:
+        """Return what embreex itself returns: the yardstick for `nearest` and all that is built on it."""
+        found: dict[str, Any] = self._scene.run(origins, directions, dists=reach.copy(), query="INTERSECT", output=True)
+        return found
 
-def in_chunks(work: Callable[[slice], B], n: int) -> list[B]:
-    """Apply a function to consecutive chunks of ``range(n)`` on all cores; the results come in order."""
-    return list(_pool().map(work, chunks(n)))
+
+def in_chunks(work: Callable[[slice], B], n: int, done: Callable[[int], None] | None = None) -> list[B]:
+    """Apply a function to consecutive chunks of ``range(n)`` on all cores; the results come in order.
+
+    ``done`` is told, on the calling thread, how many of the n have been worked on.
+    """
+    results = []
+    for rows, result in zip(chunks(n), _pool().map(work, chunks(n)), strict=True):
+        results.append(result)
+        if done:
+            done(rows.stop)
+    return results
 
 
 def on_all_cores(work: Callable[[A], B], items: Iterable[A]) -> list[B]:

@@ -37,21 +37,26 @@ def read_scene(path: Path) -> Scene:
     if path.suffix.lower() not in FORMATS:
         raise SceneError(f"{path}: unknown mesh format {path.suffix!r} (known: {', '.join(FORMATS)})")
     if not path.is_file():
-        raise SceneError(f"{path}: there is no such file")
+        raise SceneError(f"{path}: {'this is a folder, expected a file' if path.is_dir() else 'there is no such file'}")
+    if path.stat().st_size == 0:
+        raise SceneError(f"{path}: the file is empty")
     import trimesh
 
     try:
-        loaded: Any = trimesh.load(path, process=False)
+        with np.errstate(over="ignore"):  # a vertex too far for float32 is refused as infinite
+            loaded: Any = trimesh.load(path, process=False)
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise SceneError(f"{path}: cannot read this mesh: {reason}") from None
+        raise SceneError(f"{path}: cannot read this mesh, which is damaged or cut short: {reason}") from None
     try:
-        return _from_graph(loaded) if isinstance(loaded, trimesh.Scene) else _from_mesh(loaded, path)
+        with np.errstate(over="ignore"):
+            return _from_graph(loaded) if isinstance(loaded, trimesh.Scene) else _from_mesh(loaded, path)
     except SceneError as error:
         raise SceneError(f"{path}: {error}") from None
 
 
 def _from_mesh(loaded: Any, path: Path) -> Scene:
+    _check_length(getattr(loaded, "metadata", {}).get("_ply_raw", {}))
     faces = getattr(loaded, "faces", None)
     if faces is None or len(faces) == 0:
         raise SceneError("the mesh is empty: it has no triangles")
@@ -61,7 +66,19 @@ def _from_mesh(loaded: Any, path: Path) -> Scene:
     return _lit((thing,), np.zeros(1, np.int32), IDENTITY[None], (_material(loaded),), path.suffix.lower() in _Y_UP)
 
 
+def _check_length(elements: Any) -> None:
+    """Refuse a PLY file that holds less than its header announces: trimesh reads the rest of a text file in silence."""
+    for what, element in elements.items():
+        data, announced = element.get("data"), element.get("length", 0)
+        columns = data.values() if isinstance(data, dict) else [] if data is None else [data]
+        found = min((len(column) for column in columns), default=0)
+        if found < announced:
+            raise SceneError(f"the file is cut short: it announces {announced} of element {what} and has {found}")
+
+
 def _from_graph(graph: Any) -> Scene:
+    if not graph.geometry:
+        raise SceneError("nothing could be read: it is empty, cut short, or in another format than its ending says")
     objects: list[SceneObject] = []
     materials: list[Material] = []
     index: dict[str, int] = {}
@@ -100,6 +117,8 @@ def _lit(objects: Any, owner: Any, transforms: Any, materials: Any, y_up: bool) 
     """Add a sky, and a lamp above and beside the scene that gives its centre an irradiance of about 2."""
     scene = Scene(objects, owner, transforms, materials)
     low, high = (corner.astype(np.float64) for corner in scene.bounds)
+    if (low == high).all():
+        raise SceneError(f"the mesh has no extent: all its vertices lie at {low.tolist()}")
     centre, radius = 0.5 * (low + high), max(0.5 * float(np.linalg.norm(high - low)), 1e-30)
     up = (0.0, 1.0, 0.0) if y_up else (0.0, 0.0, 1.0)
     aside = np.array([-1.0, 2.0, 1.0]) if y_up else np.array([-1.0, -1.0, 2.0])

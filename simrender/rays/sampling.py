@@ -20,14 +20,14 @@ _ONE = np.uint64(1)
 _TO_UNIT = 2.0**-53
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _mix(z):  # type: ignore[no-untyped-def]
     z = (z ^ (z >> _S30)) * _MIX1
     z = (z ^ (z >> _S27)) * _MIX2
     return z ^ (z >> _S31)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def path_key(seed, pixel, sample, depth):  # type: ignore[no-untyped-def]
     """Return the key (uint64) of a path's vertex: all random numbers drawn there are `uniform` of it.
 
@@ -39,13 +39,13 @@ def path_key(seed, pixel, sample, depth):  # type: ignore[no-untyped-def]
     return _mix(key ^ (np.uint64(depth) * _GOLDEN + _ONE))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def uniform(key, dimension):  # type: ignore[no-untyped-def]
     """Return the random number (float64 in [0, 1)) of one dimension of a key."""
     return float(_mix(key + np.uint64(dimension + 1) * _GOLDEN) >> _S11) * _TO_UNIT
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def cosine_direction(nx, ny, nz, u1, u2):  # type: ignore[no-untyped-def]
     """Return a cosine-distributed direction about the unit normal (nx, ny, nz).
 
@@ -63,7 +63,7 @@ def cosine_direction(nx, ny, nz, u1, u2):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def offset_origin(origin, bits, i, nx, ny, nz):  # type: ignore[no-untyped-def]
     """Move row i of ``origin`` off its surface, towards the normal, in place.
 

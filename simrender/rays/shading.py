@@ -60,27 +60,30 @@ class Surfaces:
         sky = scene.environment
         self.sky = np.array([*sky.zenith, *sky.horizon, *sky.ground, *sky.up], dtype=np.float64)
         self.points = np.array([(*p.position, *p.intensity) for p in scene.points], np.float64).reshape(-1, 6)
-        # An area light is the set of all triangles of one emissive mesh; a point on it is chosen by area.
         emits = np.any(self.materials[:, 4:] > 0, axis=1)
-        self.light_first, self.light_triangles, self.light_area = _area_lights(scene, emits)
+        self.light_first, self.light_rows = self._area_lights(np.flatnonzero(emits[scene.mesh_material]), scene)
 
+    def _area_lights(self, meshes: NDArray[np.int64], scene: Scene) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return the first triangle of each area light, and a row a triangle.
 
-def _area_lights(
-    scene: Scene, emits: NDArray[np.bool_]
-) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]:
-    """Return (first triangle of each light, its triangles, the running area within the light)."""
-    triangles = scene.triangles
-    first, chosen, areas = [0], [], []
-    for mesh in np.flatnonzero(emits[scene.mesh_material]):
-        rows = np.flatnonzero(triangles.mesh == mesh).astype(np.int32)
-        if len(rows) == 0:
-            continue
-        a, b, c = (triangles.vertices[triangles.faces[rows, k]].astype(np.float64) for k in range(3))
-        chosen.append(rows)
-        areas.append(np.cumsum(0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)))
-        first.append(first[-1] + len(rows))
-    empty_rows, empty_areas = np.zeros(0, np.int32), np.zeros(0)
-    return np.array(first), np.concatenate([empty_rows, *chosen]), np.concatenate([empty_areas, *areas])
+        An area light is the set of all triangles of one emissive mesh, in all its instances; a point on it is chosen by
+        area. A row holds a corner, two edges, the unit normal, the emission, and the running area within the light.
+        """
+        first, rows = [0], [np.zeros((0, 16))]
+        for mesh in meshes:
+            corners = self.vertices[self.faces[scene.triangles.mesh == mesh]].astype(np.float64)
+            a, e, f = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+            normal = np.cross(e, f)
+            size = np.linalg.norm(normal, axis=1)
+            emission = np.tile(self.materials[scene.mesh_material[mesh], 4:], (len(a), 1))
+            solid = size > 0
+            table = np.column_stack(
+                [a, e, f, normal / np.where(solid, size, 1.0)[:, None], emission, np.cumsum(0.5 * size)]
+            )
+            if solid.any():
+                rows.append(table[solid])
+                first.append(first[-1] + int(solid.sum()))
+        return np.array(first), np.concatenate(rows)
 
 
 def camera_rays(camera: NDArray[np.float64], size: tuple[int, int], seed: int, sample: int) -> tuple[Any, Any]:
@@ -102,7 +105,7 @@ def camera_rays(camera: NDArray[np.float64], size: tuple[int, int], seed: int, s
     return origins, directions
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _camera_rays(camera, width, height, seed, sample, origins, directions):  # type: ignore[no-untyped-def]
     for pixel in range(width * height):
         key = path_key(seed, pixel, sample, 0)
@@ -149,12 +152,12 @@ def shade(rays: dict[str, Any], hits: Any, surfaces: Surfaces, bounces: Bounces,
         rays["direction"], rays["throughput"], rays["pixel"], rays["sample"], rays["kind"], rays["diffuse"],
         rays["mirror"], hits.primitive, hits.u, hits.v,
         surfaces.vertices, surfaces.faces, surfaces.material, surfaces.materials, surfaces.sky, surfaces.points,
-        surfaces.light_first, surfaces.light_triangles, surfaces.light_area,
+        surfaces.light_first, surfaces.light_rows,
         bounces.diffuse, bounces.mirror, bounces.roulette, seed,
         radiance, children, out["origin"], out["origin"].view(np.int32), out["direction"], out["throughput"],
         out["reach"], out["parent"], out["kind"],
     )  # fmt: skip
-    columns = {name: column[:spawned].copy() for name, column in out.items()}
+    columns = {name: column[:spawned] for name, column in out.items()}
     parent = columns["parent"]
     for name in ("pixel", "sample", "diffuse", "mirror"):
         columns[name] = rays[name][parent]
@@ -163,7 +166,7 @@ def shade(rays: dict[str, Any], hits: Any, surfaces: Surfaces, bounces: Bounces,
     return {"radiance": radiance, "children": children, **columns}
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _sky(sky, dx, dy, dz, channel):  # type: ignore[no-untyped-def]
     height = dx * sky[9] + dy * sky[10] + dz * sky[11]
     if height >= 0.0:
@@ -173,10 +176,10 @@ def _sky(sky, dx, dy, dz, channel):  # type: ignore[no-untyped-def]
     return sky[3 + channel] * (1.0 - blend) + sky[6 + channel] * blend
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _shade(  # type: ignore[no-untyped-def]
     direction, throughput, pixel, sample, kind, diffuse_bounces, mirror_bounces, primitive, u, v,
-    vertices, faces, material_of, materials, sky, points, light_first, light_triangles, light_area,
+    vertices, faces, material_of, materials, sky, points, light_first, light_rows,
     most_diffuse, most_mirror, roulette, seed,
     radiance, children, out_origin, out_bits, out_direction, out_throughput, out_reach, out_parent, out_kind,
 ):  # fmt: skip
@@ -208,16 +211,20 @@ def _shade(  # type: ignore[no-untyped-def]
         length = -length if nx * dx + ny * dy + nz * dz > 0.0 else length
         nx, ny, nz = nx / length, ny / length, nz / length
 
-        m = materials[material_of[primitive[i]]]
+        m = material_of[primitive[i]]
         if kind[i] != DIFFUSE:  # light that reached a diffuse bounce directly was counted by its shadow ray
             for c in range(3):
-                radiance[i, c] = throughput[i, c] * m[4 + c]
+                radiance[i, c] = throughput[i, c] * materials[m, 4 + c]
 
         key = path_key(seed, pixel[i], sample[i], 1 + diffuse_bounces[i] + mirror_bounces[i])
-        is_mirror = uniform(key, _LOBE) < m[3]
+        is_mirror = uniform(key, _LOBE) < materials[m, 3]
         if (is_mirror and mirror_bounces[i] >= most_mirror) or (not is_mirror and diffuse_bounces[i] >= most_diffuse):
             continue
-        tr, tg, tb = throughput[i, 0] * m[0], throughput[i, 1] * m[1], throughput[i, 2] * m[2]
+        tr, tg, tb = (
+            throughput[i, 0] * materials[m, 0],
+            throughput[i, 1] * materials[m, 1],
+            throughput[i, 2] * materials[m, 2],
+        )
         strongest = max(tr, tg, tb)
         if strongest <= 0.0:
             continue
@@ -248,53 +255,52 @@ def _shade(  # type: ignore[no-untyped-def]
         mx, my, mz = 0.0, 0.0, 0.0
         for light in range(n_area + n_point):
             dimension = _LIGHTS + 4 * light
+            low = 0
             if light < n_area:
-                first, last = light_first[light], light_first[light + 1]
-                area = light_area[last - 1]
-                pick = np.searchsorted(light_area[first:last], uniform(key, dimension) * area, side="right")
-                q = light_triangles[first + min(pick, last - first - 1)]
+                low, high = light_first[light], light_first[light + 1] - 1
+                area = light_rows[high, 15]
+                target = uniform(key, dimension) * area
+                while low < high:
+                    middle = (low + high) // 2
+                    if light_rows[middle, 15] <= target:
+                        low = middle + 1
+                    else:
+                        high = middle
                 s1, s2 = math.sqrt(uniform(key, dimension + 1)), uniform(key, dimension + 2)
-                la, lb, lc = faces[q, 0], faces[q, 1], faces[q, 2]
-                w0, w1, w2 = 1.0 - s1, s1 * (1.0 - s2), s1 * s2
-                lx = w0 * vertices[la, 0] + w1 * vertices[lb, 0] + w2 * vertices[lc, 0]
-                ly = w0 * vertices[la, 1] + w1 * vertices[lb, 1] + w2 * vertices[lc, 1]
-                lz = w0 * vertices[la, 2] + w1 * vertices[lb, 2] + w2 * vertices[lc, 2]
-                gx, gy, gz = (
-                    vertices[lb, 0] - vertices[la, 0],
-                    vertices[lb, 1] - vertices[la, 1],
-                    vertices[lb, 2] - vertices[la, 2],
-                )
-                hx, hy, hz = (
-                    vertices[lc, 0] - vertices[la, 0],
-                    vertices[lc, 1] - vertices[la, 1],
-                    vertices[lc, 2] - vertices[la, 2],
-                )
-                sx, sy, sz = gy * hz - gz * hy, gz * hx - gx * hz, gx * hy - gy * hx
-                size = math.sqrt(sx * sx + sy * sy + sz * sz)
+                w1, w2 = s1 * (1.0 - s2), s1 * s2
+                lx = light_rows[low, 0] + w1 * light_rows[low, 3] + w2 * light_rows[low, 6]
+                ly = light_rows[low, 1] + w1 * light_rows[low, 4] + w2 * light_rows[low, 7]
+                lz = light_rows[low, 2] + w1 * light_rows[low, 5] + w2 * light_rows[low, 8]
             else:
                 lx, ly, lz = points[light - n_area, 0], points[light - n_area, 1], points[light - n_area, 2]
-                size = 1.0
-                sx, sy, sz = 0.0, 0.0, 0.0
             wx, wy, wz = lx - px, ly - py, lz - pz
             squared = wx * wx + wy * wy + wz * wz
-            if squared <= 0.0 or size <= 0.0:
+            if squared <= 0.0:
                 continue
             away = math.sqrt(squared)
             cosine = (wx * nx + wy * ny + wz * nz) / away
             if cosine <= 0.0:
                 continue
             if light < n_area:
-                facing = (wx * sx + wy * sy + wz * sz) / (away * size)
+                sx, sy, sz = light_rows[low, 9], light_rows[low, 10], light_rows[low, 11]
+                facing = (wx * sx + wy * sy + wz * sz) / away
                 geometry = cosine * abs(facing) * area / (squared * math.pi)
-                le = materials[material_of[q]]
-                cr, cg, cb = tr * le[4] * geometry, tg * le[5] * geometry, tb * le[6] * geometry
+                cr, cg, cb = (
+                    tr * light_rows[low, 12] * geometry,
+                    tg * light_rows[low, 13] * geometry,
+                    tb * light_rows[low, 14] * geometry,
+                )
                 # The light's own surface must not shadow it: aim at a point moved off it, towards the ray.
                 flip = -1.0 if facing > 0.0 else 1.0
-                sx, sy, sz = flip * sx / size, flip * sy / size, flip * sz / size
+                sx, sy, sz = flip * sx, flip * sy, flip * sz
             else:
                 geometry = cosine / (squared * math.pi)
-                power = points[light - n_area]
-                cr, cg, cb = tr * power[3] * geometry, tg * power[4] * geometry, tb * power[5] * geometry
+                cr, cg, cb = (
+                    tr * points[light - n_area, 3] * geometry,
+                    tg * points[light - n_area, 4] * geometry,
+                    tb * points[light - n_area, 5] * geometry,
+                )
+                sx, sy, sz = 0.0, 0.0, 0.0
             weight = 0.2126 * cr + 0.7152 * cg + 0.0722 * cb
             total += weight
             if weight > 0.0 and uniform(key, dimension + 3) * total < weight:

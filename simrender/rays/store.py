@@ -79,3 +79,17 @@ class Store:
         if not self._warned:
             warnings.warn(message, CacheWarning, stacklevel=3)
         self._warned = True
+
+
+class NoStore(Store):
+    """A store that keeps nothing: for traces that are to stay in memory."""
+
+    def __init__(self) -> None:
+        super().__init__("nowhere")
+
+    def load(self, name: str) -> None:  # noqa: ARG002
+        """Find nothing."""
+        return
+
+    def save(self, name: str, columns: dict[str, Any]) -> None:
+        """Keep nothing."""

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from simrender.rays import embree
 from simrender.rays.kinds import CAMERA, KINDS
 from simrender.rays.scene import Scene
-from simrender.rays.store import FORMAT_VERSION, Store
+from simrender.rays.store import FORMAT_VERSION, NoStore, Store
 
 if TYPE_CHECKING:
     from simrender.rays.shading import Bounces, Surfaces
@@ -51,8 +51,8 @@ GEOMETRY = ("origin", "direction", "reach", "throughput", "pixel", "sample", "ki
 OUTCOME = ("t", "primitive", "radiance", "children", "kind", "pixel")
 """What a replay needs, stored apart from the geometry so that it reads no more than this."""
 
-Progress = Callable[[int, int], None]
-"""Called with (generation, rays in it) before a generation is traced."""
+Progress = Callable[[int, int, int], None]
+"""Called with (generation, rays traced, rays in it) while a generation is traced, from 0 rays on."""
 
 
 class Trace:
@@ -74,7 +74,7 @@ class Trace:
     cache : Path or None
         Folder of the trace cache; None takes the default one.
     progress : callable, optional
-        Told before each generation is traced.
+        Told how far tracing has come.
 
     Attributes
     ----------
@@ -175,13 +175,15 @@ class Trace:
     def geometry(self, generation: int) -> Columns:
         """Return the geometry columns of one generation."""
         self._know(self.first[generation])
+        if generation == 0 and 0 not in self._geometry:
+            self._geometry[0] = self._first_rays()  # made as fast as read, so they are not stored
         if generation not in self._geometry:
             found = self.store.load(f"{generation:03d}-rays")
             rays = self.first[generation + 1] - self.first[generation]
             if found is None or not _fits(found, GEOMETRY, rays):
                 # Damaged since it was written: the same rays come out when they are traced again.
                 again = Trace(self.scene, self.camera, self.size, self.samples, self.bounces, self.seed)
-                again.store = _Nowhere()
+                again.store = NoStore()
                 again._know(self.first[generation])
                 found = again._geometry[generation]
                 self.store.save(f"{generation:03d}-rays", found)
@@ -231,8 +233,6 @@ class Trace:
 
         rays = self._first_rays() if generation == 0 else self._spawned_rays(generation)
         count = len(rays["kind"])
-        if self.progress:
-            self.progress(generation, count)
         scene, surfaces = self.everything, self.surfaces
 
         def work(rows: slice) -> Columns:
@@ -242,23 +242,30 @@ class Trace:
             shaded["parent"] = shaded["parent"] + np.int32(rows.start)
             return shaded | {"t": hits.t, "primitive": hits.primitive}
 
-        parts = embree.in_chunks(work, count)
+        work(slice(0, 0))  # loads the kernels, or compiles them the first time
+        report = partial(self._report, generation, count)
+        report(0)
+        parts = embree.in_chunks(work, count, report)
         self.traced_rays += count
-        outcome = {n: np.concatenate([p[n] for p in parts]) for n in ("t", "primitive", "radiance", "children")}
-        outcome |= {"kind": rays["kind"], "pixel": rays["pixel"]}
-        self._geometry[generation] = rays
-        self._geometry[generation + 1] = {n: np.concatenate([p[n] for p in parts]) for n in GEOMETRY}
-        if generation == 0:
-            self.store.save("000-rays", rays)
-        # The next generation's rays before these hits: a run that was cut off goes on from them.
-        self.store.save(f"{generation + 1:03d}-rays", self._geometry[generation + 1])
-        self.store.save(f"{generation:03d}-hits", outcome)
+        found = ("t", "primitive", "radiance", "children")
+        joined = embree.on_all_cores(lambda n: np.concatenate([p[n] for p in parts]), found + GEOMETRY)
+        outcome = dict(zip(found, joined, strict=False)) | {"kind": rays["kind"], "pixel": rays["pixel"]}
+        spawned = dict(zip(GEOMETRY, joined[len(found) :], strict=True))
+        self._geometry[generation], self._geometry[generation + 1] = rays, spawned
+        files = ((f"{generation + 1:03d}-rays", spawned), (f"{generation:03d}-hits", outcome))
+        embree.on_all_cores(lambda file: self.store.save(*file), files)
         return outcome
+
+    def _report(self, generation: int, count: int, done: int) -> None:
+        if self.progress:
+            self.progress(generation, done, count)
 
     def _first_rays(self) -> Columns:
         from simrender.rays import shading
 
-        cast = [shading.camera_rays(self.camera, self.size, self.seed, s) for s in range(self.samples)]
+        cast = embree.on_all_cores(
+            lambda sample: shading.camera_rays(self.camera, self.size, self.seed, sample), range(self.samples)
+        )
         n = self.pixels * self.samples
         return {
             "origin": np.concatenate([o for o, _ in cast]),
@@ -282,19 +289,6 @@ class Trace:
                 found = self._geometry[generation]
             self._geometry[generation] = found
         return self._geometry[generation]
-
-
-class _Nowhere(Store):
-    """A store that keeps nothing."""
-
-    def __init__(self) -> None:
-        super().__init__("nowhere")
-
-    def load(self, name: str) -> None:  # noqa: ARG002
-        return None
-
-    def save(self, name: str, columns: Columns) -> None:
-        pass
 
 
 def _fits(columns: Columns, names: tuple[str, ...], rows: int) -> bool:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from simrender.cards import Card, Count, Document, Size
+from simrender.cards import Card, Count, Document, Quantity, Size
 from simrender.catalog import find_card, load_function
 from simrender.errors import CardError, SceneError
 from simrender.rays.meshes import FORMATS, read_scene
@@ -47,7 +47,11 @@ Resolution = Annotated[tuple[int, int], BeforeValidator(_size)]
 
 
 class PublishedCard(Card):
-    """The size of the real thing; the scene's own size where a field is left out."""
+    """The size of the real thing; the scene's own size where a field is left out.
+
+    ``growth`` makes the scene larger by any factor, as section 5.2 of the ray queue cycling paper does: so many times
+    the triangles in each mesh, so many times the instances, and so the square of it in instanced triangles.
+    """
 
     resolution: Resolution
     samples: Annotated[int, Field(ge=1, le=65535)]
@@ -56,6 +60,7 @@ class PublishedCard(Card):
     instanced_triangles: Count | None = None
     geometry_bytes: Size | None = None
     texture_bytes: Size | None = None
+    growth: Count = Quantity(1.0)
 
 
 class TracedCard(Card):
@@ -180,11 +185,11 @@ class Workload:
         card, scene = self.card.published, self.scene
         own_bytes = sum(m.vertices.nbytes + m.faces.nbytes for m in scene.meshes)
         return Published(
-            triangles=float(card.triangles or scene.unique_triangles),
-            instances=float(card.instances or len(scene.instance_object)),
-            instanced_triangles=float(card.instanced_triangles or scene.instanced_triangles),
-            geometry_bytes=float(own_bytes if card.geometry_bytes is None else card.geometry_bytes),
-            texture_bytes=float(card.texture_bytes or 0.0),
+            triangles=card.growth * (card.triangles or scene.unique_triangles),
+            instances=card.growth * (card.instances or len(scene.instance_object)),
+            instanced_triangles=card.growth**2 * (card.instanced_triangles or scene.instanced_triangles),
+            geometry_bytes=card.growth * (own_bytes if card.geometry_bytes is None else card.geometry_bytes),
+            texture_bytes=card.growth * (card.texture_bytes or 0.0),
         )
 
     @property

@@ -11,10 +11,12 @@ from rich.table import Table
 
 from simrender.rays import embree
 from simrender.rays.kinds import KINDS, SHADOW
-from simrender.units import format_count
+from simrender.rays.partition import Footprint
+from simrender.units import format_bytes, format_count
 
 if TYPE_CHECKING:
     from simrender.rays.trace import Columns, Trace
+    from simrender.rays.workload import Workload
 
 
 def raw_embreex_seconds(trace: Trace, clock: Callable[[], float]) -> float:
@@ -25,7 +27,7 @@ def raw_embreex_seconds(trace: Trace, clock: Callable[[], float]) -> float:
         rays = trace.geometry(generation)
 
         def work(rows: slice, rays: Columns = rays) -> None:
-            scene.nearest(rays["origin"][rows], rays["direction"][rows], rays["reach"][rows])
+            scene.raw(rays["origin"][rows], rays["direction"][rows], rays["reach"][rows])
 
         begin = clock()
         embree.in_chunks(work, len(rays["reach"]))
@@ -33,27 +35,11 @@ def raw_embreex_seconds(trace: Trace, clock: Callable[[], float]) -> float:
     return seconds
 
 
-def describe_trace(name: str, trace: Trace, seconds: float | None, raw_seconds: float | None) -> RenderableType:
-    """Return a table of a completed trace.
-
-    Parameters
-    ----------
-    name : str
-    trace : Trace
-    seconds, raw_seconds : float or None
-        Wall time of tracing through the tables, and of raw embreex; None if everything came from the cache.
-
-    """
+def describe_rays(name: str, trace: Trace) -> RenderableType:
+    """Return a table of a completed trace: rays of each kind, and how many of them hit something."""
     kind, hit = trace.column("kind"), np.isfinite(trace.column("t"))
-    table = Table(
-        box=None,
-        pad_edge=False,
-        title=f"{name}: {trace.size[0]}x{trace.size[1]}, {trace.samples} paths a pixel",
-        title_justify="left",
-    )
-    table.add_column("rays")
-    for heading in ("traced", "hit", "share"):
-        table.add_column(heading, justify="right")
+    width, height = trace.size
+    table = _table(f"{name}: {width}x{height}, {trace.samples} paths a pixel", "rays", "traced", "hit", "share")
     for k, label in enumerate(KINDS):
         rays, hits = int((kind == k).sum()), int(hit[kind == k].sum())
         word = " occluded" if k == SHADOW else ""
@@ -65,12 +51,49 @@ def describe_trace(name: str, trace: Trace, seconds: float | None, raw_seconds: 
         f"{trace.generations} bounces; {len(scene.objects)} objects, {len(scene.instance_object):,} instances, "
         f"{scene.unique_triangles:,} triangles, {scene.instanced_triangles:,} with instances\n"
     )
-    if seconds is None or raw_seconds is None:
-        table.caption += "everything came from the cache"
-    else:
-        table.caption += (
-            f"{format_count(trace.rays / seconds)}ray/s through the tables, "
-            f"{format_count(trace.rays / raw_seconds)}ray/s by embreex alone: ratio {raw_seconds / seconds:.2f}"
-        )
-    table.caption_justify = "left"
+    return table
+
+
+def describe_domains(workload: Workload, trace: Trace, domains: int) -> RenderableType:
+    """Return a table of what lies in each domain of an object partition, heaviest objects first, big ones split.
+
+    Sizes are published ones. What a machine's acceleration structures add to the bytes is on the machine's card, so it
+    is left out here.
+    """
+    parts = workload.partition(domains, Footprint(0.0, 0.0), "heaviest_first", 1 / 64)
+    primitive = trace.column("primitive")
+    domain = parts.domain_of_mesh[trace.scene.triangles.mesh[primitive[primitive >= 0]]]
+    hits = np.bincount(domain, minlength=domains)
+    table = _table("", "domain", "geometry and textures", "triangles, instanced", "nearest hits", "share")
+    for d in range(domains):
+        share = f"{hits[d] / max(1, hits.sum()):.1%}"
+        size, triangles = format_bytes(parts.weight_bytes[d]), format_count(parts.primitives[d])
+        table.add_row(str(d), size, triangles, f"{hits[d]:,}", share)
+    return table
+
+
+def describe_speed(trace: Trace, seconds: float, clock: Callable[[], float]) -> str:
+    """Return how fast the rays were traced through the tables, and how fast embreex alone traces the same rays.
+
+    Parameters
+    ----------
+    trace : Trace
+    seconds : float
+        Wall time of the tracing, storing on disk included.
+    clock : callable
+        Returns wall time in seconds.
+
+    """
+    if trace.traced_rays == 0:
+        return "every ray came from the cache"
+    raw = raw_embreex_seconds(trace, clock)
+    tables, alone = trace.traced_rays / seconds / 1e6, trace.rays / raw / 1e6
+    return f"{tables:.2f} Mray/s through the tables and onto the disk; {alone:.2f} Mray/s by embreex alone"
+
+
+def _table(title: str, first: str, *numbers: str) -> Table:
+    table = Table(box=None, pad_edge=False, title=title, title_justify="left", caption_justify="left")
+    table.add_column(first)
+    for heading in numbers:
+        table.add_column(heading, justify="right")
     return table

@@ -8,8 +8,8 @@ import pytest
 
 from simrender import simulate
 from simrender.errors import InvariantError
-from simrender.policies.ray_queue_cycling import RayQueueCycling
 from simrender.policies.rank import Counts
+from simrender.policies.ray_queue_cycling import RayQueueCycling
 from tests.scenes import garden_workload
 
 

@@ -20,25 +20,27 @@ FAR = (-260.0, 260.0, 25.0, 430.0)
 MIDDLE = (-110.0, 110.0, 12.0, 150.0)
 NEAR = (-34.0, 34.0, 1.5, 46.0)
 SUN = (-5200.0, -1500.0, 4300.0)
-SUN_IRRADIANCE = (3.3, 3.0, 2.5)
+SUN_IRRADIANCE = (3.5, 3.1, 2.5)
 
 PALETTE = {
-    "meadow": Material((0.17, 0.25, 0.055)),
-    "hay": Material((0.30, 0.29, 0.09)),
-    "forest floor": Material((0.085, 0.12, 0.035)),
+    "lush meadow": Material((0.15, 0.26, 0.05)),
+    "meadow": Material((0.20, 0.28, 0.06)),
+    "pasture": Material((0.25, 0.295, 0.075)),
+    "hay": Material((0.31, 0.305, 0.10)),
+    "forest floor": Material((0.15, 0.215, 0.05)),
     "earth": Material((0.21, 0.16, 0.10)),
     "cliff": Material((0.30, 0.29, 0.27)),
-    "lake": Material((0.50, 0.62, 0.68), mirror=0.85),
+    "lake": Material((0.72, 0.82, 0.88), mirror=1.0),
     "oak bark": Material((0.13, 0.095, 0.065)),
     "birch bark": Material((0.62, 0.60, 0.55)),
     "spruce bark": Material((0.15, 0.10, 0.075)),
-    "oak dark": Material((0.055, 0.105, 0.022)),
-    "oak": Material((0.095, 0.175, 0.035)),
-    "oak light": Material((0.16, 0.25, 0.05)),
-    "birch": Material((0.17, 0.26, 0.055)),
-    "birch light": Material((0.27, 0.34, 0.08)),
-    "spruce": Material((0.035, 0.085, 0.045)),
-    "spruce light": Material((0.07, 0.14, 0.06)),
+    "oak dark": Material((0.075, 0.145, 0.03)),
+    "oak": Material((0.125, 0.225, 0.045)),
+    "oak light": Material((0.20, 0.31, 0.065)),
+    "birch": Material((0.21, 0.32, 0.07)),
+    "birch light": Material((0.31, 0.39, 0.10)),
+    "spruce": Material((0.055, 0.12, 0.065)),
+    "spruce light": Material((0.10, 0.19, 0.085)),
     "maple": Material((0.33, 0.12, 0.03)),
     "maple light": Material((0.48, 0.23, 0.04)),
     "fern": Material((0.10, 0.22, 0.035)),
@@ -59,9 +61,9 @@ SPRUCE = (INDEX["spruce"], INDEX["spruce light"])
 MAPLE = (INDEX["oak"], INDEX["maple"], INDEX["maple light"])
 STONE = (INDEX["dark stone"], INDEX["stone"], INDEX["stone"])
 GRASS = ((INDEX["grass"], INDEX["dry grass"]), (INDEX["grass"], INDEX["fern"]), (INDEX["dry grass"],))
-TUFT = {"size": 0.55, "blades": 24, "slim": 0.025, "pitch": 2.4, "droop": 0.25, "clump": 0.3}
+TUFT = {"size": 0.6, "blades": 24, "slim": 0.03, "pitch": 2.2, "droop": 0.3, "clump": 0.5}
 REED = {"size": 1.7, "blades": 30, "slim": 0.015, "pitch": 6.0, "droop": 0.1, "clump": 0.6}
-BLOOM = {"size": 0.55, "green": INDEX["grass"], "heart": INDEX["yolk"]}
+BLOOM = {"size": 0.62, "green": INDEX["grass"], "heart": INDEX["yolk"]}
 
 
 def landscape(*, seed: int = 1, detail: float = 1.0) -> Scene:
@@ -90,7 +92,7 @@ def landscape(*, seed: int = 1, detail: float = 1.0) -> Scene:
     things, instance_object, instance_transform = instances(placed)
     squared = sum(c * c for c in SUN)
     sun = PointLight(SUN, (SUN_IRRADIANCE[0] * squared, SUN_IRRADIANCE[1] * squared, SUN_IRRADIANCE[2] * squared))
-    sky = Environment(zenith=(0.10, 0.25, 0.66), horizon=(0.66, 0.79, 0.93), ground=(0.16, 0.17, 0.12))
+    sky = Environment(zenith=(0.16, 0.34, 0.80), horizon=(0.64, 0.78, 0.95), ground=(0.16, 0.17, 0.12))
     return Scene(things, instance_object, instance_transform, tuple(PALETTE.values()), (sun,), sky)
 
 
@@ -101,7 +103,7 @@ def _hills(seed: int, cells: int) -> Terrain:
     x, y = np.meshgrid(axis_x, axis_y)
     noise = Noise(seed, "hills")
     across = y + 16.0 * np.sin(x / 65.0) + 0.1 * x + 10.0 * noise(x, y, 80.0, 2)
-    z = -15.5 * step(6.0, 104.0, across) + 58.0 * step(140.0, 420.0, across)
+    z = -15.5 * step(6.0, 104.0, across) + 50.0 * step(140.0, 420.0, across)
     z += 14.0 * step(70.0, 250.0, np.abs(x)) * step(60.0, 190.0, y)
     z += (0.8 + 10.0 * step(130.0, 320.0, across)) * noise(x, y, 105.0, 3, 0.45)
     z += 0.3 * noise(x, y, 11.0, 3)
@@ -112,9 +114,10 @@ def _cover(seed: int, terrain: Terrain) -> I64:
     """Return the material of each triangle of the ground; noise frays the borders between materials."""
     x, y, z, slope = terrain.facets()
     patch = Noise(seed, "cover")(x, y, 24.0, 4, 0.65)
-    fray = generator(seed, "fray").uniform(-0.12, 0.12, x.shape)
-    material = np.where(patch + fray > 0.22, INDEX["hay"], INDEX["meadow"])
-    material[(y + 60.0 * patch > 175.0) | (slope + 0.3 * patch > 0.62)] = INDEX["forest floor"]
+    fray = generator(seed, "fray").uniform(-0.2, 0.2, x.shape)
+    tone = np.clip(2.0 + 4.0 * (patch + fray) - 0.6 * step(60.0, 200.0, y), 0.0, 3.0)
+    material = INDEX["lush meadow"] + tone.astype(np.int64)  # the four meadows follow each other, dry ones last
+    material[(y + 80.0 * (patch + fray) > 190.0) | (slope + 0.3 * patch > 0.62)] = INDEX["forest floor"]
     material[slope + 0.3 * (patch + fray) > 0.8] = INDEX["cliff"]
     material[z + 0.5 * (patch + fray) < WATER_LEVEL + 0.35] = INDEX["earth"]
     return material
@@ -148,7 +151,7 @@ def _kinds(seed: int) -> list[Kind]:
         return dry(z) * (far + 0.01) * (0.04 + step(0.2, -0.25, woods(x, y, 95.0, 3))) * step(1.3, 0.9, slope)
 
     def meadow(x: F64, y: F64, z: F64, slope: F64) -> F64:
-        return dry(z) / (4.0 + np.hypot(x, y)) ** 1.5 * (0.35 + step(-0.2, 0.3, moist(x, y, 7.0, 2)))
+        return dry(z) / (4.0 + np.hypot(x, y)) ** 1.5 * (0.6 + step(-0.2, 0.3, moist(x, y, 7.0, 2)))
 
     def drifts(shift: float) -> Suitability:
         def suits(x: F64, y: F64, z: F64, slope: F64) -> F64:
@@ -165,25 +168,25 @@ def _kinds(seed: int) -> list[Kind]:
     oak, birch = {"bark": INDEX["oak bark"], "leaves": OAK}, {"bark": INDEX["birch bark"], "leaves": BIRCH}
     maple, spruce = {"bark": INDEX["oak bark"], "leaves": MAPLE}, {"bark": INDEX["spruce bark"], "leaves": SPRUCE}
     slim = {"spread": 0.2, "bare": 0.3}
-    left, right = (-30.0, -12.0, 20.0, 36.0), (14.0, 30.0, 22.0, 40.0)
+    left, right = (-18.0, -8.0, 17.0, 27.0), (11.0, 24.0, 24.0, 44.0)
     rows: list[Kind] = [
-        Kind("old oak", broadleaf, 6000, 4, copse, left, {"height": 11.5, **oak}),
-        Kind("oak", broadleaf, 3200, 7, copse, MIDDLE, {"height": 11.0, **oak}),
+        Kind("old oak", broadleaf, 7000, 2, copse, left, {"height": 11.5, **oak}),
+        Kind("oak", broadleaf, 3000, 5, copse, MIDDLE, {"height": 11.0, **oak}),
         Kind("maple", broadleaf, 2400, 5, copse, right, {"height": 8.5, **maple}),
         Kind("tall spruce", conifer, 2600, 5, copse, right, {"height": 15.0, **spruce}),
-        Kind("birch 1", broadleaf, 1100, 22, copse, MIDDLE, {"height": 10.0, **birch, **slim}),
-        Kind("birch 2", broadleaf, 800, 26, copse, MIDDLE, {"height": 8.5, **birch, **slim}),
-        Kind("young oak", broadleaf, 700, 50, copse, MIDDLE, {"height": 7.5, **oak}),
-        Kind("spruce 1", conifer, 800, 45, copse, MIDDLE, {"height": 13.0, **spruce}),
-        Kind("spruce 2", conifer, 500, 60, spruces, FAR, {"height": 14.0, **spruce}),
-        *(Kind(f"far oak {i}", broadleaf, 200 + 40 * i, 230, leafy, FAR, {"height": 9.0 + i, **oak}) for i in range(3)),
+        Kind("birch 1", broadleaf, 1000, 18, copse, MIDDLE, {"height": 10.0, **birch, **slim}),
+        Kind("birch 2", broadleaf, 700, 20, copse, MIDDLE, {"height": 8.5, **birch, **slim}),
+        Kind("young oak", broadleaf, 600, 36, copse, MIDDLE, {"height": 7.5, **oak}),
+        Kind("spruce 1", conifer, 700, 32, copse, MIDDLE, {"height": 13.0, **spruce}),
+        Kind("spruce 2", conifer, 420, 50, spruces, FAR, {"height": 14.0, **spruce}),
+        *(Kind(f"far oak {i}", broadleaf, 170 + 30 * i, 240, leafy, FAR, {"height": 9.0 + i, "bare": 0.18, **oak}) for i in range(3)),
         *(Kind(f"far birch {i}", broadleaf, 190, 120, leafy, FAR, {"height": 9.0, **birch, **slim}) for i in range(2)),
         Kind("far maple", broadleaf, 220, 45, leafy, FAR, {"height": 8.5, **maple}),
-        *(Kind(f"far spruce {i}", conifer, 130, 380, spruces, FAR, {"height": 11.0 + i, **spruce}) for i in range(3)),
-        *(Kind(f"bush {i}", shrub, 240, 70, copse, MIDDLE, {"size": 1.7 + 0.4 * i, "leaves": OAK}) for i in range(2)),
+        *(Kind(f"far spruce {i}", conifer, 104, 420, spruces, FAR, {"height": 11.0 + i, **spruce}) for i in range(3)),
+        *(Kind(f"bush {i}", shrub, 220, 50, copse, MIDDLE, {"size": 1.7 + 0.4 * i, "leaves": OAK}) for i in range(2)),
         Kind("rose bush", shrub, 360, 14, meadow, NEAR, {"size": 1.3, "leaves": OAK, "blossom": INDEX["poppy"]}),
         *(Kind(f"fern {i}", rosette, 110, 120, meadow, NEAR, {"size": 0.7, "leaves": (INDEX["fern"],)}) for i in range(2)),
-        *(Kind(f"grass {i}", rosette, 48, 750, meadow, NEAR, {"leaves": GRASS[i], **TUFT}) for i in range(3)),
+        *(Kind(f"grass {i}", rosette, 48, 880, meadow, NEAR, {"leaves": GRASS[i], **TUFT}) for i in range(3)),
         Kind("poppies", flower, 54, 220, drifts(0.0), NEAR, {"petal": INDEX["poppy"], **BLOOM}),
         Kind("daisies", flower, 90, 180, drifts(40.0), NEAR, {"petal": INDEX["daisy"], **BLOOM}),
         Kind("lavender", flower, 90, 180, drifts(90.0), NEAR, {"petal": INDEX["lavender"], **BLOOM}),
