@@ -276,11 +276,16 @@ def load_workload(name: str, overrides: Sequence[str] = (), cache: Path | None =
 def _mesh_card(path: Path, scene: Scene) -> Document:
     """Return a card for a mesh file: the whole mesh in view, from above and aside."""
     low, high = (corner.astype(np.float64) for corner in scene.bounds)
-    centre, radius = 0.5 * (low + high), max(0.5 * float(np.linalg.norm(high - low)), 1e-30)
-    up = np.array(scene.environment.up)
-    aside = np.array([0.9, 0.55, 1.0]) if up[1] else np.array([0.9, -1.0, 0.55])
-    fov = 35.0
-    position = centre + aside / np.linalg.norm(aside) * radius * 1.05 / math.sin(math.radians(fov) / 2.0)
+    centre, up = 0.5 * (low + high), np.array(scene.environment.up)
+    towards = np.array([0.9, 0.55, 1.0]) if up[1] else np.array([0.9, -1.0, 0.55])
+    towards /= np.linalg.norm(towards)
+    fov, aspect = 35.0, 16 / 9
+    right = np.cross(up, towards) / np.linalg.norm(np.cross(up, towards))
+    # As near as every vertex stays in the image, and a little further.
+    x, y, z = np.stack([right, np.cross(towards, right), towards]) @ (scene.triangles.vertices - centre).T
+    half = math.tan(math.radians(fov) / 2.0)
+    distance = 1.08 * float((z + np.maximum(np.abs(x) / aspect, np.abs(y)) / half).max())
+    position = centre + towards * max(distance, 1e-30)
     text = f"""\
 title: {path.name!r}
 published: {{resolution: 1920x1080, samples: 8}}
