@@ -334,8 +334,10 @@ class _Progress:
         if self._bar is None:
             from rich.progress import Progress
 
-            self._bar = Progress(console=_console(stderr=True), transient=True)
-            self._bar.start()
+            console = _console(stderr=True)
+            self._bar = Progress(console=console, transient=True)
+            if console.is_terminal:
+                self._bar.start()
             self._task = self._bar.add_task("")
             self._begin = time.perf_counter()
         self.seconds = time.perf_counter() - self._begin
@@ -344,7 +346,7 @@ class _Progress:
         )
 
     def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
+        if self._bar is not None and self._bar.live.is_started:  # else it would leave an empty line
             self._bar.stop()
 
 

@@ -25,7 +25,7 @@ class Ran(NamedTuple):
 
 
 @pytest.fixture(scope="session", autouse=True)
-def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def trace_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """Keep the traces of this session in a temporary folder, never in the user's cache."""
     folder = tmp_path_factory.mktemp("cache")
     with pytest.MonkeyPatch.context() as patch:

@@ -243,7 +243,7 @@ def test_at_half_saturation_a_kernel_runs_at_half_its_rate(gpu):
 
 
 @check
-@given(st.floats(0, 1e9), st.floats(0, 1e9), st.floats(0, 1e12), st.floats(1.0, 100.0))
+@given(st.integers(0, 10**9), st.integers(0, 10**9), st.floats(0, 1e12), st.floats(1.0, 100.0))
 def test_more_work_never_takes_less_time(coherent, incoherent, primitives, factor):
     gpu = Processor("gpu0", load_dgx2().gpu)
     time = gpu.trace_seconds(coherent, incoherent, primitives)
