@@ -10,12 +10,13 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from simrender.hardware.machine import load_machine
     from simrender.rays.workload import load_workload
-    from simrender.simulation import Result, simulate
+    from simrender.result import Result
+    from simrender.simulation import simulate
 
 __all__ = ["Result", "load_machine", "load_workload", "simulate"]
 
 _HOMES = {
-    "Result": "simrender.simulation",
+    "Result": "simrender.result",
     "load_machine": "simrender.hardware.machine",
     "load_workload": "simrender.rays.workload",
     "simulate": "simrender.simulation",

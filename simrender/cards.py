@@ -205,6 +205,7 @@ class Document:
 
     def __init__(self, text: str, where: str) -> None:
         self.where = where
+        self.prefix: Path = ()
         self.positions: dict[Path, str] = {}
         self.keys: dict[Path, str] = {}
         self._mistakes: list[str] = []
@@ -264,6 +265,14 @@ class Document:
 
     def _at(self, node: yaml.Node) -> str:
         return f"{self.where}:{node.start_mark.line + 1}:{node.start_mark.column + 1}"
+
+    def section(self, name: str, data: dict[str, Any]) -> Document:
+        """Return a section as a document of its own, with the given content, that still knows where it was written."""
+        inner = Document("{}", self.where)
+        inner.data, inner.prefix = dict(data), (*self.prefix, name)
+        inner.positions = {p[1:]: at for p, at in self.positions.items() if p[:1] == (name,)} or {(): self.position(())}
+        inner.keys = {p[1:]: at for p, at in self.keys.items() if p[:1] == (name,)}
+        return inner
 
     def position(self, path: Path) -> str:
         """Return ``file:line:column`` of a path, or of the nearest section around it."""
@@ -378,7 +387,8 @@ class Document:
             message = f"{message.removeprefix('Input ')}, got {given}"
         if position.endswith("."):  # of a --set
             return f"{position}{dotted(path)}: {message}"
-        return f"{position}: {dotted(path)}: {message}" if path else f"{position}: {message}"
+        whole = dotted((*self.prefix, *path))
+        return f"{position}: {whole}: {message}" if whole else f"{position}: {message}"
 
 
 def _clipped(value: Any) -> str:

@@ -100,7 +100,9 @@ def find_card(kind: Kind, name: str) -> CardFile:
         return CardFile(path.stem if path.stem != "card" else path.resolve().parent.name, path)
     known = cards(kind)
     if name not in known:
-        raise UnknownNameError(kind, name, known)
+        other: Kind = "workload" if kind == "machine" else "machine"
+        hint = f"{name!r} is a {other}; the machine comes first, then the workload" if name in cards(other) else ""
+        raise UnknownNameError(kind, name, known, hint)
     return known[name]
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from simrender.cards import Document
-    from simrender.simulation import Result
+    from simrender.result import Result
 
 app = App(
     name="simrender",
@@ -146,7 +146,6 @@ def trace(
 
     if image:
         check_target("--image", image, (".png",))
-    _check_seed(seed)
     if not 1 <= domains <= MOST_DOMAINS:
         raise UsageError(f"--domains {domains}: expected 1 to {MOST_DOMAINS}")
     sections = split_assignments(set_, ("workload",))
@@ -223,7 +222,6 @@ def run(
     targets = [path.resolve() for path in (Path(json or "-"), image, timeline) if path]
     if len(set(targets)) < len(targets):
         raise UsageError("--json, --image and --timeline: two of them name the same file")
-    _check_seed(seed)
     count = _islands(islands)
     begin = time.perf_counter()
     with _Progress() as progress:
@@ -267,11 +265,6 @@ def _islands(text: str) -> int | Literal["auto"]:
         return int(text)
     except ValueError:
         raise UsageError(f"--islands {text}: expected a number of islands, or auto") from None
-
-
-def _check_seed(seed: int) -> None:
-    if seed < 0:
-        raise UsageError(f"--seed {seed}: a seed is not negative")
 
 
 def _show_card(document: Document) -> None:

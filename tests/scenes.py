@@ -81,4 +81,4 @@ def garden_workload(
 ) -> Workload:
     """The garden as a workload; the default is traced at its published size."""
     document = Document(CARD.format(published=published, traced=traced, samples=samples), "garden.yaml")
-    return Workload("garden", document.validate(WorkloadCard), "garden.yaml", Path(), cache, scene or garden())
+    return Workload("garden", document.validate(WorkloadCard), document, Path(), cache, scene or garden())

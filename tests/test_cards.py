@@ -522,7 +522,7 @@ def test_a_bad_set_of_a_workload_says_which_and_why(tiny_card, assignment, messa
 
 
 def test_a_number_among_a_generators_arguments_is_a_number(tiny_card):
-    card = workload(tiny_card, "scene.arguments={density: 1e9, name: no, count: 3}")
+    card = workload(tiny_card, "scene={generator: 'a:b', arguments: {density: 1e9, name: no, count: 3}}")
     assert card.scene.arguments == {"density": 1e9, "name": "no", "count": 3}
     assert isinstance(card.scene.arguments["density"], float)
 

@@ -107,13 +107,13 @@ def test_a_scene_without_a_source_or_with_two(bad, tiny_card):
 
 
 def test_a_generator_that_cannot_be_loaded_or_makes_no_scene(bad, tiny_card):
-    text, where = tiny_card.read_text(), f"{tiny_card}: scene.generator"
+    text, where = tiny_card.read_text(), f"{tiny_card}:4:20: scene.generator"
     for scene, message in (
         ("'nosuch:f'", "cannot load 'nosuch:f' (written as package.module:function): No module named 'nosuch'"),
         ("'os:getcwd'", "os:getcwd returned a str, not a Scene"),
         (
             "'os:getcwd', arguments: {size: 3}",
-            "os:getcwd does not take these arguments: posix.getcwd() takes no keyword arguments",
+            "os:getcwd does not take these arguments: got an unexpected keyword argument 'size'",
         ),
     ):
         tiny_card.write_text(text.replace("file: bumpy.ply", f"generator: {scene}"))
@@ -294,7 +294,7 @@ def test_a_trace_has_no_machine(bad, tiny_card):
         ("--islands", 17, "--islands 17: 16 GPUs make 1 to 16 islands, or auto"),
         ("--islands", "many", "--islands many: expected a number of islands, or auto"),
         ("--islands", 2.0, "--islands 2.0: expected a number of islands, or auto"),
-        ("--seed", -1, "--seed -1: a seed is not negative"),
+        ("--seed", -1, "--seed -1: expected a number from 0 to 2^64 - 1"),
         ("--seed", 1.5, "--seed 1.5: expected a whole number"),
         ("--seed", 10**30, f"--seed {10**30}: expected a whole number of up to 18 digits"),
     ],
@@ -314,7 +314,7 @@ def test_islands_of_a_policy_that_has_none(bad, tiny_card):
 
 
 def test_the_seed_of_a_trace_is_checked_too(bad, tiny_card):
-    assert bad("trace", tiny_card, "--seed", -1) == "--seed -1: a seed is not negative"
+    assert bad("trace", tiny_card, "--seed", -1) == "--seed -1: expected a number from 0 to 2^64 - 1"
 
 
 # Where results are to go, said before the work starts
@@ -662,3 +662,37 @@ def test_version_and_help(run_cli):
         ran = run_cli(*command)
         assert (ran.code, ran.err) == (0, "")
         assert "Usage: simrender" in ran.out
+
+
+def test_a_policy_on_a_card_is_checked_where_it_stands(bad, tiny_card):
+    card = tiny_card.read_text()
+    tiny_card.write_text(card + "policy: {name: ray_queue_cycling, slots: one, copie: explicit}\n")
+    line = card.count("\n") + 1
+    assert bad("run", "dgx2", tiny_card).splitlines() == [
+        f"{tiny_card}:{line}:42: policy.slots: expected a whole number, got 'one'",
+        f"{tiny_card}:{line}:47: policy.copie: unknown field; did you mean 'copy'? "
+        "(known: copy, merging, slots, ray_bytes, partition, split_share)",
+    ]
+    tiny_card.write_text(card + "policy: {name: 3}\n")
+    message = "policy: a policy has a name, for instance {name: ray_queue_cycling}"
+    assert bad("run", "dgx2", tiny_card) == f"{tiny_card}:{line}:9: {message}"
+
+
+def test_a_generator_that_fails_says_how(bad, tiny_card):
+    scene = "generator: 'fractions:Fraction', arguments: {numerator: x}"
+    tiny_card.write_text(tiny_card.read_text().replace("file: bumpy.ply", scene))
+    assert "fractions:Fraction failed: ValueError: Invalid literal for Fraction: 'x'" in bad("run", "dgx2", tiny_card)
+
+
+def test_machine_and_workload_in_the_wrong_order(bad):
+    assert "'island' is a workload; the machine comes first, then the workload" in bad("run", "island", "dgx2")
+
+
+def test_a_gpu_without_any_memory_left(bad, tiny_card):
+    message = bad("run", "dgx2", tiny_card, "--set", "machine.gpu.memory=0.5 GiB")
+    assert message.endswith("gpu: reserved_memory (1 GiB) leaves nothing of memory (0.5 GiB)")
+
+
+def test_more_traced_pixels_than_published_ones(bad, tiny_card):
+    message = bad("run", "dgx2", tiny_card, "--set", "workload.traced.resolution=640x360")
+    assert message.endswith("traced.resolution 640x360 is larger than published.resolution 64x36")

@@ -15,7 +15,8 @@ from simrender import load_machine, simulate
 from simrender.errors import UsageError
 from simrender.policies.image_parallel import ImageParallel
 from simrender.policies.ray_queue_cycling import RayQueueCycling
-from simrender.simulation import reference_image, sampling_error
+from simrender.result import sampling_error
+from simrender.simulation import reference_image
 from tests.scenes import garden_workload
 
 LARGE = {"published": "1920x1280", "traced": "96x64"}

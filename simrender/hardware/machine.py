@@ -53,7 +53,7 @@ class MachineCard(Card):
     """
 
     title: str
-    gpus: int = Field(ge=1)
+    gpus: int = Field(ge=1, strict=True)
     gpu: ProcessorCard
     nvlink: FabricCard | None = None
     pcie: FabricCard | None = None

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 
 import simpy
+from pydantic import model_validator
 
 from simrender.cards import Bandwidth, Card, Count, Duration, RayCount, RayRate, Size
 from simrender.clock import to_ticks
@@ -31,6 +32,14 @@ class ProcessorCard(Card):
     half_saturation: RayCount
     bvh_triangle_bytes: Size
     bvh_instance_bytes: Size
+
+    @model_validator(mode="after")
+    def _leaves_memory(self) -> ProcessorCard:
+        if self.reserved_memory >= self.memory:
+            raise ValueError(
+                f"reserved_memory ({self.reserved_memory.text}) leaves nothing of memory ({self.memory.text})"
+            )
+        return self
 
 
 class HostCard(Card):
@@ -87,7 +96,8 @@ class Processor:
 
         Launch latency plus (rays + half-saturation rays) x cost of a ray. The cost grows with the logarithm of the
         primitives searched, which is the idealised renderer of the islands paper (figure 7); the half-saturation rays
-        are how many it takes to run at half of the peak rate (Hockney's n-half).
+        are how many it takes to run at half of the peak rate (Hockney's n-half), counted at the cost of the slowest
+        kind there is.
 
         Parameters
         ----------
@@ -98,12 +108,12 @@ class Processor:
 
         """
         card = self.card
-        rays = coherent + incoherent
-        if rays == 0 or primitives == 0:
+        if coherent + incoherent == 0 or primitives == 0:
             return float(card.launch_latency)
         depth = math.log2(1.0 + primitives) / math.log2(1.0 + card.rate_primitives)
-        work = depth * (coherent / card.coherent_rate + incoherent / card.incoherent_rate)
-        return card.launch_latency + work * (1.0 + card.half_saturation / rays)
+        slowest = card.incoherent_rate if incoherent else card.coherent_rate
+        work = coherent / card.coherent_rate + incoherent / card.incoherent_rate + card.half_saturation / slowest
+        return card.launch_latency + depth * work
 
     def stream_seconds(self, nbytes: float) -> float:
         """Return how long a kernel runs that is bound by the memory it reads and writes."""

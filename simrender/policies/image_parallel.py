@@ -7,7 +7,8 @@ from typing import Annotated, ClassVar
 
 from pydantic import ConfigDict, Field
 
-from simrender.policies.rank import ACCUMULATED_BYTES, PIXEL_BYTES, Rank, Steps
+from simrender.policies.frame import Steps
+from simrender.policies.rank import ACCUMULATED_BYTES, PIXEL_BYTES, Rank
 
 
 @dataclass(frozen=True)

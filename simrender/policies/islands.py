@@ -134,10 +134,17 @@ def fit(gpus: int, islands: int | None, need: Need, capacity_bytes: float, *, re
     needed = need(layout.islands, layout.size)
     enough: int | None = layout.ranks
     if not (needed <= capacity_bytes).all():
-        enough = None if replicated else next((k for k in _sizes(gpus) if holds(1, k)), None)
+        enough = None if replicated else _fewest(need, capacity_bytes)
     return Fit(layout, needed, capacity_bytes, enough)
 
 
-def _sizes(gpus: int) -> range:
-    """Sizes of an island worth trying; the model may need fewer GPUs than an unlucky number of islands left it."""
-    return range(1, max(_SEARCH_LIMIT, gpus) + 1)
+def _fewest(need: Need, capacity_bytes: float) -> int | None:
+    """Return the fewest GPUs that hold the model in one island; more may be needed than there are, or none may do."""
+
+    def holds(size: int) -> bool:
+        return bool((need(1, size) <= capacity_bytes).all())
+
+    if not holds(_SEARCH_LIMIT):
+        return None  # a part that cannot be split is too large for any GPU
+    fewest = max(1, int(need(1, 1).sum() / capacity_bytes))
+    return next(size for size in range(fewest, _SEARCH_LIMIT + 1) if holds(size))

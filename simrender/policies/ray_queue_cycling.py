@@ -10,7 +10,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import ConfigDict, Field
 
-from simrender.policies.rank import ACCUMULATED_BYTES, PIXEL_BYTES, Rank, RayQueue, Steps
+from simrender.policies.frame import RayQueue, Steps
+from simrender.policies.rank import ACCUMULATED_BYTES, PIXEL_BYTES, Rank
 from simrender.rays.partition import Method
 
 

@@ -9,7 +9,7 @@ scene is partitioned, which is what makes equally near hits resolve alike everyw
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -115,7 +115,8 @@ class Mesh:
         outside = np.flatnonzero(((indices < 0) | (indices >= len(vertices))).any(axis=1))
         if len(outside):
             where = f"the first is face {outside[0]}: {indices[outside[0]].tolist()}"
-            raise SceneError(f"{len(outside)} faces point outside the {len(vertices)} vertices; {where}")
+            faces = f"{len(outside)} face points" if len(outside) == 1 else f"{len(outside)} faces point"
+            raise SceneError(f"{faces} outside the {len(vertices)} vertices; {where}")
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", np.ascontiguousarray(indices, dtype=np.int32))
 
@@ -254,9 +255,22 @@ class Scene:
 
     @cached_property
     def bounds(self) -> tuple[F32, F32]:
-        """Lowest and highest corner of the scene in world space."""
-        vertices = self.triangles.vertices
-        return vertices.min(axis=0), vertices.max(axis=0)
+        """Lowest and highest corner of a box around the boxes of all instances, without writing them out."""
+        low = np.array([np.min([m.vertices.min(axis=0) for m in o.meshes], axis=0) for o in self.objects])
+        high = np.array([np.max([m.vertices.max(axis=0) for m in o.meshes], axis=0) for o in self.objects])
+        matrix, of = self.instance_transform, self.instance_object
+        centre, half = 0.5 * (low + high)[of], 0.5 * (high - low)[of]
+        centre = np.einsum("nij,nj->ni", matrix[:, :, :3], centre) + matrix[:, :, 3]
+        half = np.einsum("nij,nj->ni", np.abs(matrix[:, :, :3]), half)
+        return (centre - half).min(axis=0).astype(np.float32), (centre + half).max(axis=0).astype(np.float32)
+
+    def scaled(self, factor: float) -> Scene:
+        """Return the scene in other units of length: every length times a factor, radiance as it is."""
+        points = tuple(
+            PointLight(tuple(x * factor for x in p.position), tuple(i * factor**2 for i in p.intensity))  # type: ignore[arg-type]
+            for p in self.points
+        )
+        return replace(self, instance_transform=self.instance_transform * np.float32(factor), points=points)
 
     @cached_property
     def key(self) -> str:

@@ -56,7 +56,9 @@ class Store:
         except (FileNotFoundError, NotADirectoryError):
             return None
         except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zipfile.LargeZipFile) as error:
-            self._warn(f"the cache file {path} is damaged ({error}); it is discarded and computed again")
+            # NumPy's own words about a file that is no archive advise to load it unsafely.
+            reason = "not an archive of arrays" if isinstance(error, ValueError) else str(error) or "cut short"
+            self._warn(f"the cache file {path} is damaged ({reason}); it is discarded and computed again")
             path.unlink(missing_ok=True)
             return None
 
@@ -69,6 +71,7 @@ class Store:
             handle, temporary = tempfile.mkstemp(dir=self.folder, prefix=f".{name}-")
             with os.fdopen(handle, "wb") as file:
                 np.savez(file, allow_pickle=False, **columns)
+            Path(temporary).chmod(0o644)
             Path(temporary).replace(path)
         except OSError as error:
             if temporary:

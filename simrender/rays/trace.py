@@ -28,6 +28,7 @@ children     u1       how many rays it spawns: 0, 1 or 2
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable
 from functools import cached_property, partial
 from pathlib import Path
@@ -51,6 +52,9 @@ GEOMETRY = ("origin", "direction", "reach", "throughput", "pixel", "sample", "ki
 OUTCOME = ("t", "primitive", "radiance", "children", "kind", "pixel")
 """What a replay needs, stored apart from the geometry so that it reads no more than this."""
 
+_HANDY = (1.0, 1e6)
+"""Sizes of a scene that are traced as they are."""
+
 Progress = Callable[[int, int, int], None]
 """Called with (generation, rays traced, rays in it) while a generation is traced, from 0 rays on."""
 
@@ -61,6 +65,7 @@ class Trace:
     Parameters
     ----------
     scene : Scene
+        Very small and very large ones are traced in other units of length; `Trace.scene` is what is traced.
     camera : float64 array (4, 3)
         Position, forward, right, up, as `shading.camera_rays` takes it.
     size : (width, height)
@@ -94,10 +99,13 @@ class Trace:
         cache: Path | None = None,
         progress: Progress | None = None,
     ) -> None:
-        self.scene, self.camera, self.size, self.samples = scene, camera, size, samples
+        factor = _handy(scene)
+        self.scene = scene if factor == 1.0 else scene.scaled(factor)
+        self.camera = camera * np.array([[factor], [1.0], [1.0], [1.0]])
+        self.size, self.samples = size, samples
         self.bounces, self.seed, self.progress = bounces, seed, progress
         self.pixels = size[0] * size[1]
-        facts = f"{FORMAT_VERSION} {scene.key} {camera.tobytes().hex()} {size} {samples} {bounces} {seed}"
+        facts = f"{FORMAT_VERSION} {self.scene.key} {self.camera.tobytes().hex()} {size} {samples} {bounces} {seed}"
         self.key = hashlib.blake2b(facts.encode(), digest_size=16).hexdigest()
         self.store = Store(self.key, cache)
         self.traced_rays = 0
@@ -289,6 +297,17 @@ class Trace:
                 found = self._geometry[generation]
             self._geometry[generation] = found
         return self._geometry[generation]
+
+
+def _handy(scene: Scene) -> float:
+    """Return the power of two that brings a very small or very large scene to a size of about a hundred.
+
+    Near the world's origin secondary rays start a fixed small distance off their surface (Waechter and Binder), which
+    must be small against the scene. A power of two changes no digit of a coordinate.
+    """
+    low, high = scene.bounds
+    size = float(np.linalg.norm(high.astype(np.float64) - low))
+    return 1.0 if size == 0.0 or _HANDY[0] <= size <= _HANDY[1] else 2.0 ** round(math.log2(128.0 / size))
 
 
 def _fits(columns: Columns, names: tuple[str, ...], rows: int) -> bool:

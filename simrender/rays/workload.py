@@ -6,6 +6,7 @@ it, batches and latencies do not.
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,12 +16,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
 from simrender.cards import Card, Count, Document, Quantity, Size
 from simrender.catalog import find_card, load_function
-from simrender.errors import CardError, SceneError
+from simrender.errors import CardError, SceneError, UsageError
 from simrender.rays.meshes import FORMATS, read_scene
 from simrender.rays.partition import Footprint, Method, Partition, Published, partition, pieces
 from simrender.rays.scene import Scene
@@ -80,6 +81,8 @@ class SceneCard(Card):
     def _one_source(self) -> SceneCard:
         if (self.file is None) == (self.generator is None):
             raise ValueError("a scene has exactly one of the fields file and generator")
+        if self.file is not None and self.arguments:
+            raise ValueError("arguments are for a generator, and this scene comes from a file")
         return self
 
 
@@ -128,6 +131,20 @@ class WorkloadCard(Card):
     bounces: BouncesCard = BouncesCard()
     policy: dict[str, Any] = Field(default_factory=lambda: {"name": "ray_queue_cycling"})
 
+    @field_validator("policy")
+    @classmethod
+    def _has_a_name(cls, policy: dict[str, Any]) -> dict[str, Any]:
+        if not isinstance(policy.get("name"), str):
+            raise ValueError("a policy has a name, for instance {name: ray_queue_cycling}")
+        return policy
+
+    @model_validator(mode="after")
+    def _traced_stands_for_published(self) -> WorkloadCard:
+        (width, height), (w, h) = self.published.resolution, self.traced.resolution
+        if w * h > width * height:
+            raise ValueError(f"traced.resolution {w}x{h} is larger than published.resolution {width}x{height}")
+        return self
+
 
 @dataclass(eq=False)
 class Workload:
@@ -137,8 +154,8 @@ class Workload:
     ----------
     name : str
     card : WorkloadCard
-    source : str
-        The card's file, for messages.
+    document : Document
+        The card as it was written, for messages.
     folder : Path
         Where the card lies.
     cache : Path or None
@@ -148,7 +165,7 @@ class Workload:
 
     name: str
     card: WorkloadCard
-    source: str
+    document: Document
     folder: Path
     cache: Path | None = None
     given: Scene | None = None
@@ -170,11 +187,16 @@ class Workload:
         scene = self.card.scene
         if scene.file is not None:
             return read_scene(self.folder / scene.file)
-        where = f"{self.source}: scene.generator"
+        where = f"{self.document.position(('scene', 'generator'))}: scene.generator"
+        generator = load_function(scene.generator or "", where)
         try:
-            made = load_function(scene.generator or "", where)(**scene.arguments)
+            inspect.signature(generator).bind(**scene.arguments)
         except TypeError as error:
             raise CardError([f"{where}: {scene.generator} does not take these arguments: {error}"]) from None
+        try:
+            made = generator(**scene.arguments)
+        except Exception as error:
+            raise SceneError(f"{where}: {scene.generator} failed: {type(error).__name__}: {error}") from error
         if not isinstance(made, Scene):
             raise SceneError(f"{where}: {scene.generator} returned a {type(made).__name__}, not a Scene")
         return made
@@ -208,6 +230,7 @@ class Workload:
 
     def trace(self, seed: int = 1, progress: Progress | None = None) -> Trace:
         """Return the ray table for a seed; nothing is traced before it is asked for."""
+        check_seed(seed)
         if seed not in self._traces:
             (width, height), size = self.card.published.resolution, self.card.traced.resolution
             camera = self.card.camera.frame(width / height)
@@ -268,9 +291,22 @@ def load_workload(name: str, overrides: Sequence[str] = (), cache: Path | None =
         path, document, name = found.path, found.document(), found.name
     for override in overrides:
         document.override(WorkloadCard, override, "workload")
-    return Workload(
-        path.stem if given else name, document.validate(WorkloadCard), document.where, path.parent, cache, given
-    )
+    card = document.validate(WorkloadCard)
+    if card.scene.file != path.name:
+        given = None  # another scene was set
+    return Workload(path.stem if given else name, card, document, path.parent, cache, given)
+
+
+def check_seed(seed: int) -> None:
+    """Refuse a seed that is not a 64-bit number.
+
+    Raises
+    ------
+    UsageError
+
+    """
+    if not 0 <= seed < 2**64:
+        raise UsageError(f"--seed {seed}: expected a number from 0 to 2^64 - 1")
 
 
 def _mesh_card(path: Path, scene: Scene) -> Document:

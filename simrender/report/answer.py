@@ -11,7 +11,7 @@ from rich.text import Text
 from simrender.units import format_bytes, format_count, format_seconds
 
 if TYPE_CHECKING:
-    from simrender.simulation import Result
+    from simrender.result import Result
 
 _COLORS = {"trace": "green", "shade": "dark_green", "copy": "blue", "wait": "bright_black"}
 _BAR = 48
@@ -26,8 +26,11 @@ def answer(result: Result) -> RenderableType:
     table.add_column()
     time = result.frame_time_s or 0.0
     error = result.sampling_error["relative_standard_error"]
-    table.add_row("frame rate", _figure(result.frames_per_s or 0.0, error, "frames/s"))
-    table.add_row("frame time", f"{format_seconds(time)} ± {format_seconds(time * error)} (sampling)")
+    rate = result.frames_per_s or 0.0
+    figure = f"{rate:.3g}" if rate < 999.5 else f"{rate:,.0f}"
+    sampling = f" ± {100 * error:.2g} % (sampling)" if error else " (every pixel was traced)"
+    table.add_row("frame rate", Text(f"{figure} frames/s").append(sampling, style="not bold"), style="bold")
+    table.add_row("frame time", f"{format_seconds(time)}{sampling}")
     table.add_row("", _calibration(result))
     table.add_row("islands", _islands(result))
     table.add_row("memory", _memory(result))
@@ -36,11 +39,6 @@ def answer(result: Result) -> RenderableType:
     table.add_row("left out", Text("; ".join(item["what"] for item in result.scope["left_out"]), style="dim"))
     title = Text(f"{result.workload} on {result.machine} under {result.policy}", style="bold underline")
     return Group(title, table)
-
-
-def _figure(value: float, relative_error: float, unit: str) -> Text:
-    text = Text(f"{value:.3g} {unit}", style="bold")
-    return text.append(f" ± {value * relative_error:.1g} (sampling)", style="not bold")
 
 
 def _calibration(result: Result) -> Text:
@@ -86,7 +84,8 @@ def _rays(result: Result) -> str:
 def _infeasible(result: Result) -> list[Any]:
     m, needed = result.memory, result.memory["gpus_needed"]
     need, capacity = format_bytes(m["needed_bytes"]), format_bytes(m["capacity_bytes"])
-    size = f"{result.islands} island{'s' if result.islands != 1 else ''} of {result.island_size} GPUs"
+    islands, gpus = ("s" if n != 1 else "" for n in (result.islands, result.island_size))
+    size = f"{result.islands} island{islands} of {result.island_size} GPU{gpus}"
     lines = [
         Text(f"{result.workload} does not fit on {result.machine} under {result.policy}", style="bold red"),
         Text(f"In {size}, the fullest GPU would need {need} and has {capacity}."),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from simrender.timeline import COPIES, KERNELS
 
 if TYPE_CHECKING:
-    from simrender.simulation import Result
+    from simrender.result import Result
 
 _TICKS_PER_MICROSECOND = 1e6
 

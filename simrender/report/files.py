@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from simrender.errors import UsageError
 
 if TYPE_CHECKING:
-    from simrender.simulation import Result
+    from simrender.result import Result
 
 
 def check_target(option: str, path: Path, endings: tuple[str, ...]) -> None:

@@ -12,7 +12,7 @@ from simrender.timeline import COPIES, KERNELS
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from simrender.simulation import Result
+    from simrender.result import Result
 
 COLORS = {
     "generate": "#c7c7c7",

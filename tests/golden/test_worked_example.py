@@ -3,7 +3,7 @@
 Sixteen pixels, one path each, two triangles, no bounces: each GPU generates eight rays, traces them against its own
 triangle, passes them on, traces the others', passes them back, shades, and GPU 0 gathers the picture. With a launch
 latency of 10 us, 1 Mray/s, 1 GB/s everywhere, a copy latency of 5 us, and a host that takes 1 us to issue a kernel, 2 us
-to issue a copy and 3 us to read a counter:
+to issue a copy, 3 us to read a counter:
 
 - a generate kernel takes 10 + 8 * 88 / 1000 = 10.704 us, a trace kernel 10 + 8 = 18 us, a copy 5.704 us;
 - the host issues generate, trace and copy for GPU 0 (at 1, 2 and 4 us), then for GPU 1 (at 5, 6 and 8 us);
@@ -62,8 +62,8 @@ def two_triangles(tmp_path):
     mesh = Mesh(np.array([[-1, 0, -1], [1, 0, -1], [0, 0, 1]], np.float32), np.array([[0, 1, 2]]))
     objects = (SceneObject("near", (mesh,)), SceneObject("far", (mesh,)))
     scene = Scene(objects, np.array([0, 1]), placed(np.array([[0, 0, 0], [0, 2, 0]]), np.ones(2)), MATERIALS)
-    card = Document(CARD, "two.yaml").validate(WorkloadCard)
-    return Workload("two", card, "two.yaml", tmp_path, tmp_path, scene)
+    document = Document(CARD, "two.yaml")
+    return Workload("two", document.validate(WorkloadCard), document, tmp_path, tmp_path, scene)
 
 
 def test_two_gpus_to_the_picosecond(two_triangles):

@@ -8,7 +8,7 @@ import pytest
 
 from simrender import simulate
 from simrender.errors import InvariantError
-from simrender.policies.rank import Counts
+from simrender.policies.frame import Counts
 from simrender.policies.ray_queue_cycling import RayQueueCycling
 from tests.scenes import garden_workload
 

@@ -26,7 +26,7 @@ def test_vertices_that_are_not_finite_are_counted_and_the_first_is_named():
 
 @pytest.mark.parametrize("face", [[0, 1, 3], [-1, 1, 2]])
 def test_faces_that_point_outside_are_named(face):
-    with pytest.raises(SceneError, match=r"1 faces point outside the 3 vertices; the first is face 0"):
+    with pytest.raises(SceneError, match=r"1 face points outside the 3 vertices; the first is face 0"):
         Mesh(TRIANGLE, np.array([face]))
 
 

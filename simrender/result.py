@@ -1,0 +1,186 @@
+"""What a simulation found, and what it owns up to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from simrender.cards import UNCALIBRATED, Quantity
+from simrender.hardware.machine import Machine
+from simrender.policies.frame import Frame
+from simrender.rays.kinds import KINDS, SHADOW
+from simrender.rays.trace import Trace
+from simrender.timeline import KERNELS, Timeline
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LEFT_OUT = (
+    (
+        "loading the scene and building acceleration structures",
+        "a frame of an animation or an interactive session has them",
+    ),
+    ("textures and alpha tests", "their cost is inside the calibrated trace rates, the same for every ray"),
+    ("arithmetic of the shade, generate and tone-mapping kernels", "they are charged for the memory they move"),
+    ("the display and the way to it", "the frame ends when its pixels are in order on GPU 0"),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """What a simulation found.
+
+    Attributes
+    ----------
+    machine, workload, policy : str
+    seed : int
+    gpus, islands, island_size, unused_gpus : int
+        GPUs that were offered; islands and GPUs of each; GPUs that were left over.
+    feasible : bool
+        Whether the model and the queues fit. Where they do not, nothing was simulated: times and hashes are None.
+    memory : dict
+        ``needed_bytes`` (of the fullest GPU), ``capacity_bytes``, ``model_bytes`` and each buffer's bytes of that GPU;
+        ``gpus_needed``, the smallest number of such GPUs that would do (None if none would).
+    frame_time_s : float or None
+    utilization : dict
+        Share of the frame during which each device computes.
+    breakdown : dict
+        Share of the frame that an average GPU spends on each kind of work, on copies, and waiting. Sums to 1.
+    counts : dict
+        Rays, tests, bytes, kernels; ``published`` in a name means real ones, otherwise traced ones.
+    sampling_error : dict
+        ``relative_standard_error`` of the rays of a frame (and so of its time), and how it was estimated.
+    uncalibrated : list of dict
+        The assumed and calibrated values that the result hangs on: path, value, status, source.
+    scope : dict
+        ``modelled`` and ``left_out``, with reasons.
+    image_sha256, event_log_sha256 : str or None
+
+    """
+
+    machine: str
+    workload: str
+    policy: str
+    seed: int
+    gpus: int
+    islands: int
+    island_size: int
+    unused_gpus: int
+    feasible: bool
+    memory: dict[str, Any]
+    frame_time_s: float | None = None
+    utilization: dict[str, float] = field(default_factory=dict)
+    breakdown: dict[str, float] = field(default_factory=dict)
+    counts: dict[str, float] = field(default_factory=dict)
+    sampling_error: dict[str, Any] = field(default_factory=dict)
+    uncalibrated: list[dict[str, str]] = field(default_factory=list)
+    scope: dict[str, Any] = field(default_factory=dict)
+    image_sha256: str | None = None
+    event_log_sha256: str | None = None
+    image: NDArray[np.float32] | None = None
+    spans: Timeline | None = None
+
+    @property
+    def frames_per_s(self) -> float | None:
+        """The reciprocal of the frame time."""
+        return None if self.frame_time_s is None else 1.0 / self.frame_time_s
+
+    @cached_property
+    def timeline(self) -> pd.DataFrame:
+        """Every span as a table: device, kind, start_s, end_s, bytes, rays."""
+        return (self.spans or Timeline(0)).frame()
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything but the image and the timeline, ready for JSON."""
+        names = [n for n in self.__dataclass_fields__ if n not in {"image", "spans"}]
+        facts = {name: getattr(self, name) for name in names}
+        place = names.index("frame_time_s") + 1
+        return dict([*list(facts.items())[:place], ("frames_per_s", self.frames_per_s), *list(facts.items())[place:]])
+
+
+def sampling_error(trace: Trace, published: tuple[int, int]) -> dict[str, Any]:
+    """Estimate the error of tracing fewer pixels than were published.
+
+    The traced pixels are a systematic sample of the image, so the variance of the mean number of rays a pixel is
+    estimated from the differences of neighbours (Wolter, "Introduction to variance estimation", chapter 8), with the
+    finite population correction. A frame's time is nearly proportional to its rays.
+    """
+    width, height = trace.size
+    rays = np.bincount(trace.column("pixel"), minlength=trace.pixels).reshape(height, width).astype(np.float64)
+    differences = [np.diff(rays, axis=axis) for axis in (0, 1)]
+    count = sum(d.size for d in differences)
+    variance = sum(float((d * d).sum()) for d in differences) / (2.0 * count) if count else 0.0
+    share = min(1.0, trace.pixels / (published[0] * published[1]))
+    error = float(np.sqrt(variance * (1.0 - share) / trace.pixels) / rays.mean())
+    return {
+        "relative_standard_error": error,
+        "traced_pixels": trace.pixels,
+        "published_pixels": published[0] * published[1],
+        "method": "differences between neighbouring traced pixels, in rays a pixel",
+    }
+
+
+def breakdown(timeline: Timeline, frame_time_s: float) -> dict[str, float]:
+    """Return shares of the frame for an average GPU. A GPU never computes and copies at once, so they add up."""
+    shares = {k: sum(s) / len(s) / frame_time_s for k, s in timeline.seconds_by_kind().items()}
+    merged = {
+        "trace": shares["trace"],
+        "shade": shares["shade"] + shares["generate"] + shares["tonemap"] + shares["assemble"],
+        "copy": shares["copy"] + shares["merge"],
+    }
+    return {**merged, "wait": max(0.0, 1.0 - sum(merged.values()))}
+
+
+def counts(frame: Frame, machine: Machine) -> dict[str, float]:
+    """Return how much of everything there was."""
+    trace, weight = frame.trace, frame.weight
+    kinds = np.bincount(trace.column("kind"), minlength=len(KINDS))
+    occluded = int(np.isfinite(trace.column("t")[trace.column("kind") == SHADOW]).sum())
+    log = frame.timeline
+    kind = np.array(log.kind)
+    return {
+        "traced_paths": int(kinds[0]),
+        "traced_rays": trace.rays,
+        **{f"traced_{name}_rays": int(n) for name, n in zip(KINDS, kinds, strict=True)},
+        "traced_occluded_shadow_rays": occluded,
+        "published_paths": int(kinds[0]) * weight,
+        "published_rays": trace.rays * weight,
+        "ray_weight": weight,
+        "bounces": trace.generations,
+        "ray_domain_tests": frame.tests,
+        "skipped_ray_domain_tests": frame.skipped_tests,
+        "kernels": int((kind < len(KERNELS)).sum()),
+        "trace_kernels": int((kind == KERNELS.index("trace")).sum()),
+        "copies": int((kind >= len(KERNELS)).sum()),
+        "published_copied_bytes": float(
+            sum(b for b, k in zip(log.nbytes, log.kind, strict=True) if k >= len(KERNELS) or KERNELS[k] == "trace")
+        ),
+        "network_bytes": machine.network.sent_bytes if machine.has_network else 0.0,
+        "spans": len(log),
+    }
+
+
+def owned_up(quantities: list[tuple[str, Quantity]]) -> list[dict[str, str]]:
+    """Return the assumed and calibrated ones among the given quantities."""
+    return [
+        {"path": path, "value": q.text, "status": q.status, "source": q.source}
+        for path, q in quantities
+        if q.status in UNCALIBRATED
+    ]
+
+
+def scope(machine: Machine, island_size: int) -> dict[str, Any]:
+    """Return what was modelled, and what was left out, with the reasons."""
+    modelled = [f"{len(machine.processors)} GPUs, one stream each: kernel launch, saturation, memory"]
+    modelled.append("the host thread that issues kernels and copies one after the other")
+    left_out = [{"what": what, "why": why} for what, why in LEFT_OUT]
+    if machine.has_network:
+        users = "ray queues and finished pixels" if island_size > 1 else "finished pixels"
+        modelled.append(f"{machine.card.fabric_name} between the GPUs, shared max-min fairly by the copies of {users}")
+    else:
+        left_out.append({"what": machine.card.fabric_name, "why": "one GPU sends nothing"})
+    return {"modelled": modelled, "left_out": left_out}
