@@ -1,8 +1,8 @@
 """Plants and rocks as triangle meshes, from a few hundred lines and a seed.
 
-Every kind is made of three shapes: *fronds* (a rib with leaflets on both sides, which is also a leaf, a petal, a blade of
-grass or a branch of a fir), *tubes* (stems) and *blobs* (rocks and fruit). Each builder takes the number of triangles to
-aim at, so that one species serves as a hero of thousands of triangles and as a speck on a far hill: production scenes
+Every kind is made of three shapes: *fronds* (a rib with leaflets on both sides, which is also a leaf, a petal, a blade
+of grass or a branch of a fir), *tubes* (stems) and *blobs* (rocks and fruit). Each builder takes the number of triangles
+to aim at, so that one species serves as a hero of thousands of triangles and as a speck on a far hill: production scenes
 are as skewed. Objects stand on the origin, z up, in metres; where triangles are few, leaves get larger, so that a
 crown stays as dense.
 """
@@ -42,7 +42,7 @@ def fronds(
     sweep: float = 0.3,
     peak: float = 0.5,
 ) -> Part:
-    """Return ribs with triangular leaflets on both sides: 2 ``leaflets`` triangles each; one leaflet makes a plain leaf.
+    """Return ribs with triangular leaflets on both sides: 2 ``leaflets`` triangles each; one makes a plain leaf.
 
     Parameters
     ----------
@@ -168,9 +168,16 @@ def _foliage(
 
 
 def broadleaf(
-    seed: int, name: str, *, triangles: int, height: float, bark: int, leaves: Sequence[int],
-    spread: float = 0.34, bare: float = 0.28,
-) -> SceneObject:  # fmt: skip
+    seed: int,
+    name: str,
+    *,
+    triangles: int,
+    height: float,
+    bark: int,
+    leaves: Sequence[int],
+    spread: float = 0.34,
+    bare: float = 0.28,
+) -> SceneObject:
     """Build a tree of branches with clumps of leaves at their ends.
 
     Parameters
@@ -242,15 +249,24 @@ def conifer(
     for index, material in enumerate(leaves):
         k = tone == index
         up = np.broadcast_to(np.array([0.0, 0.0, 1.0]), (int(k.sum()), 3))
-        needles = fronds(root[k], forward[k], up, length[k], width[k], leaflets=leaflets, droop=0.14, fold=0.3, peak=0.35)
+        needles = fronds(
+            root[k], forward[k], up, length[k], width[k], leaflets=leaflets, droop=0.14, fold=0.3, peak=0.35
+        )
         parts.append((material, needles))
     return assemble(name, parts)
 
 
 def palm(
-    seed: int, name: str, *, triangles: int, height: float, bark: int, leaves: Sequence[int],
-    lean: float = 0.15, fruit: int | None = None,
-) -> SceneObject:  # fmt: skip
+    seed: int,
+    name: str,
+    *,
+    triangles: int,
+    height: float,
+    bark: int,
+    leaves: Sequence[int],
+    lean: float = 0.15,
+    fruit: int | None = None,
+) -> SceneObject:
     """Build a coconut palm; parameters as in `broadleaf`.
 
     ``lean`` is how far the top bends to the side, in heights; ``fruit`` is the material of the nuts.
@@ -281,8 +297,10 @@ def palm(
         k = tone == index
         n = int(k.sum())
         up = np.broadcast_to(np.array([0.0, 0.0, 1.0]), (n, 3))
-        shape = {"leaflets": leaflets, "fold": 0.35, "sweep": 0.35, "peak": 0.4}
-        blades = fronds(np.tile(crown, (n, 1)), forward[k], up, length[k], width[k], droop=droop[k], **shape)
+        blades = fronds(
+            np.tile(crown, (n, 1)), forward[k], up, length[k], width[k],
+            leaflets=leaflets, droop=droop[k], fold=0.35, sweep=0.35, peak=0.4,
+        )  # fmt: skip
         parts.append((material, blades))
     return assemble(name, parts)
 
@@ -308,9 +326,18 @@ def shrub(
 
 
 def rosette(
-    seed: int, name: str, *, triangles: int, size: float, leaves: Sequence[int],
-    blades: int = 9, slim: float = 0.22, pitch: float = 0.9, droop: float = 0.45, clump: float = 0.0,
-) -> SceneObject:  # fmt: skip
+    seed: int,
+    name: str,
+    *,
+    triangles: int,
+    size: float,
+    leaves: Sequence[int],
+    blades: int = 9,
+    slim: float = 0.22,
+    pitch: float = 0.9,
+    droop: float = 0.45,
+    clump: float = 0.0,
+) -> SceneObject:
     """Build leaves that spring from the ground: a fern, a tuft of grass, reeds or a banana plant.
 
     Parameters
@@ -349,8 +376,11 @@ def rosette(
     for index, material in enumerate(leaves):
         k = np.arange(blades) % len(leaves) == index
         up = np.broadcast_to(np.array([0.0, 0.0, 1.0]), (int(k.sum()), 3))
-        shape = {"leaflets": leaflets, "droop": droop, "fold": 0.15, "sweep": 0.2, "peak": 0.35}
-        parts.append((material, fronds(root[k], forward[k], up, length[k], slim * length[k], **shape)))
+        leaf = fronds(
+            root[k], forward[k], up, length[k], slim * length[k],
+            leaflets=leaflets, droop=droop, fold=0.15, sweep=0.2, peak=0.35,
+        )  # fmt: skip
+        parts.append((material, leaf))
     return assemble(name, parts)
 
 
@@ -375,8 +405,20 @@ def flower(
     crown = np.repeat(head, 5, axis=0)
     long = np.repeat(0.16 * size * np.ones(count), 5)
     petals = fronds(crown, out, np.repeat(forward, 5, axis=0), long, 0.45 * long, fold=-0.1)
-    hearts = fronds(head + 0.03 * forward - 0.05 * size * side, side, forward, 0.1 * size * np.ones(count), 0.05 * size * np.ones(count))
-    twice = fronds(head + 0.03 * forward - 0.05 * size * other, other, forward, 0.1 * size * np.ones(count), 0.05 * size * np.ones(count))
+    hearts = fronds(
+        head + 0.03 * forward - 0.05 * size * side,
+        side,
+        forward,
+        0.1 * size * np.ones(count),
+        0.05 * size * np.ones(count),
+    )
+    twice = fronds(
+        head + 0.03 * forward - 0.05 * size * other,
+        other,
+        forward,
+        0.1 * size * np.ones(count),
+        0.05 * size * np.ones(count),
+    )
     return assemble(name, [(green, stems), (green, blades), (petal, petals), (heart, hearts), (heart, twice)])
 
 

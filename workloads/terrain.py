@@ -261,7 +261,13 @@ def scatter(
 
 
 def stand(
-    rng: np.random.Generator, terrain: Terrain, x: F64, y: F64, *, scale: tuple[float, float] = (0.7, 1.3), sink: float = 0.0
+    rng: np.random.Generator,
+    terrain: Terrain,
+    x: F64,
+    y: F64,
+    *,
+    scale: tuple[float, float] = (0.7, 1.3),
+    sink: float = 0.0,
 ) -> F32:
     """Return transforms that stand an object upright on the ground, turned about z and scaled at random.
 

@@ -2,8 +2,8 @@
 
 Sixteen pixels, one path each, two triangles, no bounces: each GPU generates eight rays, traces them against its own
 triangle, passes them on, traces the others', passes them back, shades, and GPU 0 gathers the picture. With a launch
-latency of 10 us, 1 Mray/s, 1 GB/s everywhere, a copy latency of 5 us, and a host that takes 1 us to issue a kernel, 2 us
-to issue a copy, 3 us to read a counter:
+latency of 10 us, 1 Mray/s, 1 GB/s everywhere, a copy latency of 5 us, and a host that takes 1 us to issue a kernel,
+2 us to issue a copy and 3 us to read a counter:
 
 - a generate kernel takes 10 + 8 * 88 / 1000 = 10.704 us, a trace kernel 10 + 8 = 18 us, a copy 5.704 us;
 - the host issues generate, trace and copy for GPU 0 (at 1, 2 and 4 us), then for GPU 1 (at 5, 6 and 8 us);

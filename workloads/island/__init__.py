@@ -8,13 +8,27 @@ fires and a lamp that are area lights.
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from simrender.rays.scene import IDENTITY, Environment, Material, PointLight, Scene, SceneObject
 from workloads.plants import assemble, blob, broadleaf, fronds, log, palm, rock, rosette, shrub, tubes, unit
-from workloads.terrain import F64, I64, Kind, Noise, Placed, Terrain, generator, graded_axis, grow, instances
+from workloads.terrain import (
+    F64,
+    I64,
+    Kind,
+    Noise,
+    Placed,
+    Terrain,
+    generator,
+    graded_axis,
+    grow,
+    instances,
+    stand,
+    tiles,
+)
 from workloads.terrain import smoothstep as step
-from workloads.terrain import stand, tiles
 
 VIEWPOINT = (0.0, -62.0)
 EYE = 2.4  # height of the viewpoint, which the sea is tessellated for
@@ -131,7 +145,7 @@ def _sea(seed: int, terrain: Terrain, fine: float) -> SceneObject:
     """
     rings, spokes = max(12, round(110 * fine)), max(16, round(120 * fine))
     # Even steps in the root of the angle below the horizon: between even on screen and even on the water.
-    below = np.linspace(*np.sqrt(EYE / np.array([5.0, SEA_RADIUS])), rings) ** 2
+    below = np.linspace(math.sqrt(EYE / 5.0), math.sqrt(EYE / SEA_RADIUS), rings) ** 2
     radius = np.concatenate([[1.0], EYE / below])
     # Three quarters of the spokes cover the view of 100 degrees around positive y; the seam lies behind the viewer.
     angle = np.pi * np.interp(np.linspace(0.0, 1.0, spokes + 1), [0.0, 0.125, 0.875, 1.0], [-0.5, 0.22, 0.78, 1.5])
@@ -232,16 +246,41 @@ def _kinds(seed: int) -> list[Kind]:
         Kind("banyan", broadleaf, 6000, 4, coast, SHORE, {"height": 11.0, "spread": 0.5, "bare": 0.2, **tree}),
         Kind("breadfruit", broadleaf, 1500, 20, coast, SHORE, {"height": 8.5, **tree}),
         Kind("sea almond", broadleaf, 900, 30, coast, SHORE, {"height": 7.0, "spread": 0.45, **pale}),
-        *(Kind(f"jungle tree {i}", broadleaf, 170 + 40 * i, 330, jungle, JUNGLE, {"height": 7.5 + i, "bare": 0.15, **tree}) for i in range(4)),
-        *(Kind(f"pale tree {i}", broadleaf, 160, 220, jungle, JUNGLE, {"height": 9.0 + i, "bare": 0.2, **pale}) for i in range(2)),
-        *(Kind(f"ridge bush {i}", shrub, 70 + 20 * i, 420, ridge, JUNGLE, {"size": 4.0 + i, "leaves": TREE}) for i in range(2)),
-        *(Kind(f"naupaka {i}", shrub, 180 + 60 * i, 110, fringe, SHORE, {"size": 1.8 + 0.4 * i, "leaves": PALE}) for i in range(2)),
+        *(
+            Kind(
+                f"jungle tree {i}",
+                broadleaf,
+                170 + 40 * i,
+                330,
+                jungle,
+                JUNGLE,
+                {"height": 7.5 + i, "bare": 0.15, **tree},
+            )
+            for i in range(4)
+        ),
+        *(
+            Kind(f"pale tree {i}", broadleaf, 160, 220, jungle, JUNGLE, {"height": 9.0 + i, "bare": 0.2, **pale})
+            for i in range(2)
+        ),
+        *(
+            Kind(f"ridge bush {i}", shrub, 70 + 20 * i, 420, ridge, JUNGLE, {"size": 4.0 + i, "leaves": TREE})
+            for i in range(2)
+        ),
+        *(
+            Kind(f"naupaka {i}", shrub, 180 + 60 * i, 110, fringe, SHORE, {"size": 1.8 + 0.4 * i, "leaves": PALE})
+            for i in range(2)
+        ),
         Kind("hibiscus", shrub, 330, 45, fringe, SHORE, {"size": 1.9, "leaves": TREE, "blossom": INDEX["hibiscus"]}),
-        Kind("frangipani", shrub, 360, 30, fringe, SHORE, {"size": 2.3, "leaves": TREE, "blossom": INDEX["frangipani"]}),
-        *(Kind(f"banana {i}", rosette, 130 + 60 * i, 60, coast, SHORE, {"size": 2.6 + 0.5 * i, **banana}) for i in range(2)),
+        Kind(
+            "frangipani", shrub, 360, 30, fringe, SHORE, {"size": 2.3, "leaves": TREE, "blossom": INDEX["frangipani"]}
+        ),
+        *(
+            Kind(f"banana {i}", rosette, 130 + 60 * i, 60, coast, SHORE, {"size": 2.6 + 0.5 * i, **banana})
+            for i in range(2)
+        ),
         *(Kind(f"fern {i}", rosette, 120 + 40 * i, 160, fringe, SHORE, fern) for i in range(2)),
         *(Kind(f"beach grass {i}", rosette, 48, 330, strand, SHORE, {"size": 0.7 + 0.2 * i, **tuft}) for i in range(2)),
         *(Kind(f"rock {i}", rock, 90 + 120 * i, 26, surf, SHORE, {"size": 1.2 + 0.8 * i, **stone}) for i in range(3)),
         Kind("cliff block", rock, 420, 16, surf, (-120.0, 120.0, -40.0, 90.0), {"size": 5.0, "flat": 0.8, **stone}),
         Kind("driftwood", log, 90, 14, strand, SHORE, {"size": 2.6, "bark": INDEX["driftwood"]}),
-    ]  # fmt: skip
+    ]

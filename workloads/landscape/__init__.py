@@ -179,19 +179,28 @@ def _kinds(seed: int) -> list[Kind]:
         Kind("young oak", broadleaf, 600, 36, copse, MIDDLE, {"height": 7.5, **oak}),
         Kind("spruce 1", conifer, 700, 32, copse, MIDDLE, {"height": 13.0, **spruce}),
         Kind("spruce 2", conifer, 420, 50, spruces, FAR, {"height": 14.0, **spruce}),
-        *(Kind(f"far oak {i}", broadleaf, 170 + 30 * i, 240, leafy, FAR, {"height": 9.0 + i, "bare": 0.18, **oak}) for i in range(3)),
+        *(
+            Kind(f"far oak {i}", broadleaf, 170 + 30 * i, 240, leafy, FAR, {"height": 9.0 + i, "bare": 0.18, **oak})
+            for i in range(3)
+        ),
         *(Kind(f"far birch {i}", broadleaf, 190, 120, leafy, FAR, {"height": 9.0, **birch, **slim}) for i in range(2)),
         Kind("far maple", broadleaf, 220, 45, leafy, FAR, {"height": 8.5, **maple}),
         *(Kind(f"far spruce {i}", conifer, 104, 420, spruces, FAR, {"height": 11.0 + i, **spruce}) for i in range(3)),
         *(Kind(f"bush {i}", shrub, 220, 50, copse, MIDDLE, {"size": 1.7 + 0.4 * i, "leaves": OAK}) for i in range(2)),
         Kind("rose bush", shrub, 360, 14, meadow, NEAR, {"size": 1.3, "leaves": OAK, "blossom": INDEX["poppy"]}),
-        *(Kind(f"fern {i}", rosette, 110, 120, meadow, NEAR, {"size": 0.7, "leaves": (INDEX["fern"],)}) for i in range(2)),
+        *(
+            Kind(f"fern {i}", rosette, 110, 120, meadow, NEAR, {"size": 0.7, "leaves": (INDEX["fern"],)})
+            for i in range(2)
+        ),
         *(Kind(f"grass {i}", rosette, 48, 880, meadow, NEAR, {"leaves": GRASS[i], **TUFT}) for i in range(3)),
         Kind("poppies", flower, 54, 220, drifts(0.0), NEAR, {"petal": INDEX["poppy"], **BLOOM}),
         Kind("daisies", flower, 90, 180, drifts(40.0), NEAR, {"petal": INDEX["daisy"], **BLOOM}),
         Kind("lavender", flower, 90, 180, drifts(90.0), NEAR, {"petal": INDEX["lavender"], **BLOOM}),
         Kind("reeds", rosette, 60, 260, shore, (-120.0, 120.0, 60.0, 190.0), {"leaves": (INDEX["reed"],), **REED}),
-        *(Kind(f"stone {i}", rock, 70 + 110 * i, 40, anywhere, MIDDLE, {"size": 0.7 + 0.4 * i, "stone": STONE[i]}) for i in range(3)),
+        *(
+            Kind(f"stone {i}", rock, 70 + 110 * i, 40, anywhere, MIDDLE, {"size": 0.7 + 0.4 * i, "stone": STONE[i]})
+            for i in range(3)
+        ),
         Kind("log", log, 90, 6, meadow, NEAR, {"size": 3.0, "bark": INDEX["oak bark"]}),
-    ]  # fmt: skip
+    ]
     return rows
