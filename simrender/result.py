@@ -13,7 +13,6 @@ from simrender.cards import UNCALIBRATED, Quantity
 from simrender.hardware.machine import Machine
 from simrender.policies.frame import Frame
 from simrender.rays.kinds import KINDS, SHADOW
-from simrender.rays.trace import Trace
 from simrender.timeline import KERNELS, Timeline
 
 if TYPE_CHECKING:
@@ -53,7 +52,7 @@ class Result:
     counts : dict
         Rays, tests, bytes, kernels; ``published`` in a name means real ones, otherwise traced ones.
     sampling_error : dict
-        ``relative_standard_error`` of the rays of a frame (and so of its time), and how it was estimated.
+        ``relative_error`` of the frame time that comes from tracing fewer pixels than were published, and its parts.
     uncalibrated : list of dict
         The assumed and calibrated values that the result hangs on: path, value, status, source.
     scope : dict
@@ -102,25 +101,35 @@ class Result:
         return dict([*list(facts.items())[:place], ("frames_per_s", self.frames_per_s), *list(facts.items())[place:]])
 
 
-def sampling_error(trace: Trace, published: tuple[int, int]) -> dict[str, Any]:
-    """Estimate the error of tracing fewer pixels than were published.
+def sampling_error(frame: Frame) -> dict[str, Any]:
+    """Estimate the error of tracing fewer pixels than were published, as a share of the frame time.
 
-    The traced pixels are a systematic sample of the image, so the variance of the mean number of rays a pixel is
-    estimated from the differences of neighbours (Wolter, "Introduction to variance estimation", chapter 8), with the
-    finite population correction. A frame's time is nearly proportional to its rays.
+    Two effects are added in quadrature. A frame's time is nearly proportional to its rays; the traced pixels are a
+    systematic sample of the image, so the variance of the mean number of rays a pixel is estimated from the differences
+    of neighbours (Wolter, "Introduction to variance estimation", chapter 8), with the finite population correction. And
+    ranks wait for the fullest queue: with few pixels a rank, queues differ by chance, by the square root of the weight
+    more than they really would, so that the frame comes out too slow.
     """
-    width, height = trace.size
-    rays = np.bincount(trace.column("pixel"), minlength=trace.pixels).reshape(height, width).astype(np.float64)
+    trace, published, owner = frame.trace, frame.published, frame.owner
+    pixel = trace.column("pixel")
+    rays = np.bincount(pixel, minlength=trace.pixels).reshape(trace.size[1], trace.size[0]).astype(np.float64)
     differences = [np.diff(rays, axis=axis) for axis in (0, 1)]
     count = sum(d.size for d in differences)
     variance = sum(float((d * d).sum()) for d in differences) / (2.0 * count) if count else 0.0
     share = min(1.0, trace.pixels / (published[0] * published[1]))
-    error = float(np.sqrt(variance * (1.0 - share) / trace.pixels) / rays.mean())
+    of_rays = float(np.sqrt(variance * (1.0 - share) / trace.pixels) / rays.mean())
+    if frame.wave_mean > 0.0:
+        excess = frame.wave_excess / frame.wave_mean
+    else:  # the ranks met only at the end
+        by_rank = np.bincount(owner, rays.ravel(), minlength=frame.layout.ranks)
+        excess = float(by_rank.max() / by_rank.mean() - 1.0)
+    of_waiting = excess * (1.0 - float(np.sqrt(share)))
     return {
-        "relative_standard_error": error,
+        "relative_error": float(np.hypot(of_rays, of_waiting)),
+        "rays_relative_standard_error": of_rays,
+        "waiting_relative_bias": of_waiting,
         "traced_pixels": trace.pixels,
         "published_pixels": published[0] * published[1],
-        "method": "differences between neighbouring traced pixels, in rays a pixel",
     }
 
 

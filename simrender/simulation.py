@@ -143,7 +143,7 @@ def simulate(
         utilization={p.name: to_seconds(p.busy_ticks) / frame_time_s for p in devices.processors},
         breakdown=breakdown(frame.timeline, frame_time_s),
         counts=counts(frame, devices),
-        sampling_error=sampling_error(trace, workload.card.published.resolution),
+        sampling_error=sampling_error(frame),
         uncalibrated=owned_up(used),
         scope=scope(devices, layout.size),
         image_sha256=image_sha256,

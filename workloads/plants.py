@@ -1,10 +1,10 @@
 """Plants and rocks as triangle meshes, from a few hundred lines and a seed.
 
 Every kind is made of three shapes: *fronds* (a rib with leaflets on both sides, which is also a leaf, a petal, a blade
-of grass or a branch of a fir), *tubes* (stems) and *blobs* (rocks and fruit). Each builder takes the number of triangles
-to aim at, so that one species serves as a hero of thousands of triangles and as a speck on a far hill: production scenes
-are as skewed. Objects stand on the origin, z up, in metres; where triangles are few, leaves get larger, so that a
-crown stays as dense.
+of grass or a branch of a fir), *tubes* (stems) and *blobs* (rocks and fruit). Each builder takes the number of
+triangles to aim at, so that one species serves as a hero of thousands of triangles and as a speck on a far hill:
+production scenes are as skewed. Objects stand on the origin, z up, in metres; where triangles are few, leaves get
+larger, so that a crown stays as dense.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ def blob(rng: np.random.Generator, radii: Sequence[float], triangles: int, rough
     for wave in range(5):
         toward = unit(rng.normal(size=3)) * 1.7 * 1.5**wave
         phase = (directions * toward).sum(axis=1) + rng.uniform(0.0, 6.3)
-        lumps += (np.abs(np.sin(phase)) - 0.6) / 1.5**wave  # absolute values crease the surface as rock does
+        lumps += (np.abs(np.sin(phase)) - 0.6) / 1.35**wave  # absolute values crease the surface as rock does
     vertices = directions * (1.0 + rough * lumps)[:, None] * np.asarray(radii)
     north, south = len(vertices) - 2, len(vertices) - 1
     first = np.arange(segments)
@@ -426,7 +426,7 @@ def rock(seed: int, name: str, *, triangles: int, size: float, stone: int, flat:
     """Build a boulder about ``size`` metres across and ``flat`` times as high, a third of it in the ground."""
     rng = generator(seed, name)
     radii = 0.5 * size * np.array([1.0, rng.uniform(0.65, 0.95), flat])
-    vertices, faces = blob(rng, tuple(radii.tolist()), triangles, 0.22)
+    vertices, faces = blob(rng, tuple(radii.tolist()), triangles, 0.27)
     return assemble(name, [(stone, (vertices + np.array([0.0, 0.0, 0.3 * flat * size]), faces))])
 
 

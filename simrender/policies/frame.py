@@ -131,6 +131,9 @@ class Frame:
         Published rays for which a traced ray stands.
     published : (width, height)
         Pixels of the published image.
+    wave_mean, wave_excess : float
+        Of all waves for which the ranks waited for each other: rays of an average queue, and by how many the fullest
+        exceeded it.
 
     """
 
@@ -148,6 +151,8 @@ class Frame:
     retired: list[Ids] = field(default_factory=list)
     tests: float = 0.0
     skipped_tests: float = 0.0
+    wave_mean: float = 0.0
+    wave_excess: float = 0.0
 
     def __post_init__(self) -> None:
         self.barrier = Barrier(self.env, self.layout.ranks)

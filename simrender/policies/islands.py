@@ -14,7 +14,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-_GOLDEN = 0.6180339887498949
+_PLASTIC = (0.7548776662466927, 0.5698402909980532)
+"""The plastic number's inverse and its square: steps of Roberts' R2 sequence, evenly spread in two dimensions."""
+
 _SEARCH_LIMIT = 4096
 """GPUs up to which a machine that would hold the model is looked for."""
 
@@ -64,13 +66,13 @@ def represented_lines(traced: tuple[int, int], published_height: int) -> NDArray
     """Return, for each traced pixel, the published scan line whose fate it shares, int64 (pixels,).
 
     A traced pixel stands for a block of published ones, whose scan lines belong to several ranks. It goes to one of
-    those lines, by a golden-ratio sequence along the row, so that every rank gets the share of pixels it has in the
-    published image. Where the traced image is the published one, it is simply the pixel's own line.
+    those lines, by a low-discrepancy sequence, so that every rank gets an even sample of the image and the share of
+    pixels it has in the published one. Where the traced image is the published one, it is simply the pixel's own line.
     """
     width, height = traced
     pixel = np.arange(width * height)
     x, y = pixel % width, pixel // width
-    within = (x * _GOLDEN) % 1.0 if published_height > height else 0.0
+    within = (x * _PLASTIC[0] + y * _PLASTIC[1]) % 1.0 if published_height > height else 0.0
     return np.minimum(((y + within) * published_height / height).astype(np.int64), published_height - 1)
 
 

@@ -174,7 +174,12 @@ class Rank:
             self.index, self._done(), mine, lambda: frame.machine.host.read_counters(frame.layout.ranks)
         )
         by_rank = yield all_read
-        return Counts(*(list(column) for column in zip(*by_rank, strict=True)))
+        counts = Counts(*(list(column) for column in zip(*by_rank, strict=True)))
+        if self.index == 0:
+            sizes = np.add(counts.paths, counts.shadows)
+            frame.wave_mean += float(sizes.mean())
+            frame.wave_excess += float(sizes.max() - sizes.mean())
+        return counts
 
     def read_own_counter(self, rays: RayQueue) -> Steps:
         """Wait for this rank alone, let the host read its queue counter, and return the number of rays."""

@@ -25,7 +25,7 @@ def answer(result: Result) -> RenderableType:
     table.add_column(style="bold", no_wrap=True)
     table.add_column()
     time = result.frame_time_s or 0.0
-    error = result.sampling_error["relative_standard_error"]
+    error = result.sampling_error["relative_error"]
     rate = result.frames_per_s or 0.0
     figure = f"{rate:.3g}" if rate < 999.5 else f"{rate:,.0f}"
     sampling = f" ± {100 * error:.2g} % (sampling)" if error else " (every pixel was traced)"
