@@ -12,21 +12,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from simrender.rays.scene import Mesh, SceneObject
-from workloads.terrain import generator, grid_faces
+from workloads.terrain import F64, I64, generator, grid_faces, unit
 
-F64 = NDArray[np.float64]
-I64 = NDArray[np.int64]
 Part = tuple[F64, I64]  # vertices (n, 3) and faces (m, 3)
 
+UP = np.array([0.0, 0.0, 1.0])
 GOLDEN_ANGLE = np.pi * (3.0 - np.sqrt(5.0))
-
-
-def unit(v: F64) -> F64:
-    """Return vectors (..., 3) scaled to length 1."""
-    return np.asarray(v / np.maximum(np.sqrt((v * v).sum(axis=-1, keepdims=True)), 1e-12), np.float64)
 
 
 def fronds(
@@ -47,17 +40,15 @@ def fronds(
     Parameters
     ----------
     root, forward, up : float64 arrays (n, 3)
-        Where the rib starts, where it heads, and what its upper side faces.
+        Where the rib starts, where it heads, and what its upper side faces; ``up`` may be one vector for all.
     length, width : float64 arrays (n,)
         Of the rib, and of the longest leaflet.
     leaflets : int
         On each side.
     droop : float64 array (n,) or float
         How far the tip sinks below a straight rib, in lengths.
-    fold : float
-        How far leaflets bend away from the upper side, in widths.
-    sweep : float
-        How far leaflets lean towards the tip, in widths.
+    fold, sweep : float
+        How far leaflets bend away from the upper side, and lean towards the tip, in widths.
     peak : float
         Where on the rib, from 0 to 1, leaflets are longest.
 
@@ -82,6 +73,17 @@ def fronds(
     one = np.concatenate([np.stack([a, m + 1 + a, a + 1], 1), np.stack([a, a + 1, 2 * m + 1 + a], 1)])
     faces = one[None] + (3 * m + 1) * np.arange(len(root))[:, None, None]
     return vertices.reshape(-1, 3), faces.reshape(-1, 3)
+
+
+def dyed(part: Part, tone: I64, materials: Sequence[int]) -> list[tuple[int, Part]]:
+    """Divide the fronds of a part among materials: frond i gets ``materials[tone[i]]``."""
+    vertices, one = part[0].reshape(len(tone), -1, 3), part[1][: len(part[1]) // len(tone)]
+    parts = []
+    for index, material in enumerate(materials):
+        chosen = vertices[tone == index]
+        faces = one[None] + vertices.shape[1] * np.arange(len(chosen))[:, None, None]
+        parts.append((material, (chosen.reshape(-1, 3), faces.reshape(-1, 3))))
+    return parts
 
 
 def tubes(paths: F64, radii: F64, sides: int) -> Part:
@@ -114,18 +116,13 @@ def blob(rng: np.random.Generator, radii: Sequence[float], triangles: int, rough
         phase = (directions * toward).sum(axis=1) + rng.uniform(0.0, 6.3)
         lumps += (np.abs(np.sin(phase)) - 0.6) / 1.35**wave  # absolute values crease the surface as rock does
     vertices = directions * (1.0 + rough * lumps)[:, None] * np.asarray(radii)
-    north, south = len(vertices) - 2, len(vertices) - 1
+    band = grid_faces(rings - 2, segments)
+    band = band // (segments + 1) * segments + band % (segments + 1) % segments  # the last column is the first again
     first = np.arange(segments)
-    after = (first + 1) % segments
-    last = (rings - 2) * segments
-    row = (np.arange(rings - 2) * segments)[:, None]
-    a, b, c, d = row + first, row + after, row + segments + after, row + segments + first
-    faces = [np.stack([a, d, c], 2), np.stack([a, c, b], 2)]
-    caps = [
-        np.stack([first, after, np.full(segments, north)], 1),
-        np.stack([last + after, last + first, np.full(segments, south)], 1),
-    ]
-    return vertices, np.concatenate([f.reshape(-1, 3) for f in [*faces, *caps]])
+    after, last = (first + 1) % segments, (rings - 2) * segments
+    north = np.stack([first, after, np.full(segments, len(vertices) - 2)], 1)
+    south = np.stack([last + after, last + first, np.full(segments, len(vertices) - 1)], 1)
+    return vertices, np.concatenate([band[:, ::-1], north, south])
 
 
 def assemble(name: str, parts: Iterable[tuple[int, Part]]) -> SceneObject:
@@ -148,23 +145,19 @@ def _foliage(
 ) -> list[tuple[int, Part]]:
     """Return leaves on the upper shells of ellipsoidal clumps (n, 3), dark tones first: below, inside and by chance."""
     clump = rng.choice(len(centre), leaves, p=radii.prod(axis=1) ** (2 / 3) / (radii.prod(axis=1) ** (2 / 3)).sum())
-    outward = unit(rng.normal(size=(leaves, 3)) + np.array([0.0, 0.0, 0.25]))
+    outward = unit(rng.normal(size=(leaves, 3)) + 0.25 * UP)
     depth = rng.uniform(0.74, 1.04, leaves)
     root = centre[clump] + radii[clump] * outward * depth[:, None]
     normal = unit(outward + 0.32 * rng.normal(size=(leaves, 3)))
-    forward = unit(np.cross(normal, rng.normal(size=(leaves, 3))) - np.array([0.0, 0.0, 0.35]))
+    forward = unit(np.cross(normal, rng.normal(size=(leaves, 3))) - 0.35 * UP)
     area = float((radii[:, 0] * radii[:, 1] + 2.0 * radii[:, 0] * radii[:, 2]).sum()) * 4.2
     slim, cover = 0.36, 0.38 + 0.9 * np.exp(-leaves / 500.0)  # many leaves also cover by lying behind each other
     length = np.sqrt(cover * area / (leaves * 2.0 * slim)) * rng.uniform(0.75, 1.25, leaves)
     low, high = centre[:, 2].min() - radii[:, 2].max(), centre[:, 2].max() + radii[:, 2].max()
     light = (root[:, 2] - low) / (high - low) * 0.7 + (depth - 0.74) * 0.9 + rng.uniform(-0.18, 0.18, leaves)
     tone = np.clip(light * len(tones), 0, len(tones) - 1).astype(np.int64)
-    parts = []
-    for index, material in enumerate(tones):
-        k = tone == index
-        start = root[k] - 0.5 * length[k, None] * forward[k]
-        parts.append((material, fronds(start, forward[k], normal[k], length[k], slim * length[k], sweep=0.0)))
-    return parts
+    start = root - 0.5 * length[:, None] * forward
+    return dyed(fronds(start, forward, normal, length, slim * length, sweep=0.0), tone, tones)
 
 
 def broadleaf(
@@ -198,8 +191,7 @@ def broadleaf(
 
     """
     rng = generator(seed, name)
-    limbs = int(np.clip(triangles / 60, 4, 26))
-    sides = int(np.clip(triangles / 300, 3, 7))
+    limbs, sides = int(np.clip(triangles / 60, 4, 26)), int(np.clip(triangles / 300, 3, 7))
     crown = np.array([spread, spread, 0.5 * (1.0 - bare)]) * height
     middle = np.array([0.0, 0.0, height - crown[2]])
     # Fibonacci directions spread the clumps evenly; the lowest are left out, where a crown is hollow.
@@ -219,11 +211,10 @@ def broadleaf(
     if triangles > 150:
         at = rng.uniform(0.55, 0.95, limbs)
         start = np.stack([np.interp(at, rise, trunk[:, axis]) for axis in range(3)], axis=1)
-        bend = (start + centre) / 2 + np.array([0.0, 0.0, -0.03 * height])
         taper = 0.011 * height * np.array([1.0, 0.7, 0.25])
-        paths = np.stack([start, bend, centre], axis=1)
+        paths = np.stack([start, (start + centre) / 2 - 0.03 * height * UP, centre], axis=1)
         parts.append((bark, tubes(paths, np.broadcast_to(taper, (limbs, 3)), max(3, sides - 2))))
-    left = max(triangles - sum(len(part[1]) for _, part in parts), 24)
+    left = max(triangles - sum(len(part[1]) for _, part in parts), 12)
     return assemble(name, parts + _foliage(rng, centre, radii, left // 2, leaves))
 
 
@@ -246,14 +237,8 @@ def conifer(
     root = np.stack([np.zeros(count), np.zeros(count), at * height], axis=1)
     width = length * np.interp(leaflets, [1, 3, 6], [0.5, 0.42, 0.34])
     tone = np.clip((at * 0.6 + rng.uniform(0.0, 0.6, count)) * len(leaves), 0, len(leaves) - 1).astype(np.int64)
-    for index, material in enumerate(leaves):
-        k = tone == index
-        up = np.broadcast_to(np.array([0.0, 0.0, 1.0]), (int(k.sum()), 3))
-        needles = fronds(
-            root[k], forward[k], up, length[k], width[k], leaflets=leaflets, droop=0.14, fold=0.3, peak=0.35
-        )
-        parts.append((material, needles))
-    return assemble(name, parts)
+    needles = fronds(root, forward, UP, length, width, leaflets=leaflets, droop=0.14, fold=0.3, peak=0.35)
+    return assemble(name, parts + dyed(needles, tone, leaves))
 
 
 def palm(
@@ -278,13 +263,12 @@ def palm(
     thick = height * 0.017 * (0.75 + 0.9 * np.exp(-9.0 * t)) * (1.0 + 0.06 * (-1.0) ** np.arange(len(t)))
     parts = [(bark, tubes(path[None], thick[None], sides))]
     crown = path[-1]
-    if fruit is not None:
+    if fruit is not None and triangles > 150:
         for angle in 2.1 * np.arange(4):
             vertices, faces = blob(rng, (0.15, 0.15, 0.18), 24, 0.02)
             parts.append((fruit, (vertices + crown + 0.26 * np.array([np.cos(angle), np.sin(angle), -0.9]), faces)))
     count = int(np.clip(triangles / 45, 9, 28))
-    left = max(triangles - sum(len(part[1]) for _, part in parts), 2 * count)
-    leaflets = max(1, left // (2 * count))
+    leaflets = max(1, (triangles - sum(len(part[1]) for _, part in parts)) // (2 * count))
     age = (np.arange(count) + 0.5) / count  # the youngest fronds stand upright, the oldest hang
     angle = GOLDEN_ANGLE * np.arange(count) + rng.uniform(-0.2, 0.2, count)
     pitch = np.interp(age, [0.0, 0.3, 1.0], [1.9, 0.65, -0.3]) + rng.uniform(-0.1, 0.1, count)
@@ -293,16 +277,9 @@ def palm(
     width = length * (0.22 if leaflets > 5 else 0.14)
     droop = 0.3 + 0.35 * age
     tone = ((1.0 - age) * len(leaves)).astype(np.int64)
-    for index, material in enumerate(leaves):
-        k = tone == index
-        n = int(k.sum())
-        up = np.broadcast_to(np.array([0.0, 0.0, 1.0]), (n, 3))
-        blades = fronds(
-            np.tile(crown, (n, 1)), forward[k], up, length[k], width[k],
-            leaflets=leaflets, droop=droop[k], fold=0.35, sweep=0.35, peak=0.4,
-        )  # fmt: skip
-        parts.append((material, blades))
-    return assemble(name, parts)
+    root = np.tile(crown, (count, 1))
+    blades = fronds(root, forward, UP, length, width, leaflets=leaflets, droop=droop, fold=0.35, sweep=0.35, peak=0.4)
+    return assemble(name, parts + dyed(blades, tone, leaves))
 
 
 def shrub(
@@ -317,7 +294,7 @@ def shrub(
     parts = _foliage(rng, centre, radii, max(triangles // 2 - blooms, 6), leaves)
     if blossom is not None:
         k = rng.integers(0, clumps, blooms)
-        outward = unit(rng.normal(size=(blooms, 3)) + np.array([0.0, 0.0, 0.6]))
+        outward = unit(rng.normal(size=(blooms, 3)) + 0.6 * UP)
         forward = unit(np.cross(outward, rng.normal(size=(blooms, 3))))
         length = 0.09 * size * np.ones(blooms)
         petals = fronds(centre[k] + 1.06 * radii[k] * outward, forward, outward, length, 0.5 * length, fold=-0.2)
@@ -342,14 +319,10 @@ def rosette(
 
     Parameters
     ----------
-    seed : int
-    name : str
-    triangles : int
-        Number of triangles to aim at.
+    seed, name, triangles, leaves
+        As in `broadleaf`; the materials are taken in turn.
     size : float
         Length of the longest leaf.
-    leaves : sequence of int
-        Materials, taken in turn.
     blades : int
         Number of leaves; each gets an equal share of the triangles as its leaflets.
     slim : float
@@ -372,16 +345,10 @@ def rosette(
     where = rng.uniform(0.0, 6.3, blades)
     root = np.stack([radius * np.cos(where), radius * np.sin(where), np.full(blades, -0.02 * size)], axis=1)
     length = size * rng.uniform(0.65, 1.0, blades)
-    parts = []
-    for index, material in enumerate(leaves):
-        k = np.arange(blades) % len(leaves) == index
-        up = np.broadcast_to(np.array([0.0, 0.0, 1.0]), (int(k.sum()), 3))
-        leaf = fronds(
-            root[k], forward[k], up, length[k], slim * length[k],
-            leaflets=leaflets, droop=droop, fold=0.15, sweep=0.2, peak=0.35,
-        )  # fmt: skip
-        parts.append((material, leaf))
-    return assemble(name, parts)
+    shape = fronds(
+        root, forward, UP, length, slim * length, leaflets=leaflets, droop=droop, fold=0.15, sweep=0.2, peak=0.35
+    )
+    return assemble(name, dyed(shape, np.arange(blades) % len(leaves), leaves))
 
 
 def flower(
@@ -392,7 +359,7 @@ def flower(
     count = max(1, triangles // 18)
     where, radius = rng.uniform(0.0, 6.3, count), patch * np.sqrt(rng.random(count))
     foot = np.stack([radius * np.cos(where), radius * np.sin(where), np.full(count, -0.03)], axis=1)
-    forward = unit(0.18 * rng.normal(size=(count, 3)) + np.array([0.0, 0.0, 1.0]))
+    forward = unit(0.18 * rng.normal(size=(count, 3)) + UP)
     tall = size * rng.uniform(0.7, 1.1, count)
     side = unit(np.cross(forward, rng.normal(size=(count, 3))))
     stems = fronds(foot, forward, side, tall, np.full(count, 0.012), sweep=0.0)
@@ -402,24 +369,13 @@ def flower(
     turn = 2.0 * np.pi * np.arange(5) / 5
     out = np.cos(turn)[:, None] * side[:, None] + np.sin(turn)[:, None] * other[:, None]
     out = unit(out + 0.35 * forward[:, None]).reshape(-1, 3)
-    crown = np.repeat(head, 5, axis=0)
-    long = np.repeat(0.16 * size * np.ones(count), 5)
-    petals = fronds(crown, out, np.repeat(forward, 5, axis=0), long, 0.45 * long, fold=-0.1)
-    hearts = fronds(
-        head + 0.03 * forward - 0.05 * size * side,
-        side,
-        forward,
-        0.1 * size * np.ones(count),
-        0.05 * size * np.ones(count),
-    )
-    twice = fronds(
-        head + 0.03 * forward - 0.05 * size * other,
-        other,
-        forward,
-        0.1 * size * np.ones(count),
-        0.05 * size * np.ones(count),
-    )
-    return assemble(name, [(green, stems), (green, blades), (petal, petals), (heart, hearts), (heart, twice)])
+    long, wide = np.full(5 * count, 0.16 * size), np.full(count, 0.1 * size)
+    petals = fronds(np.repeat(head, 5, axis=0), out, np.repeat(forward, 5, axis=0), long, 0.45 * long, fold=-0.1)
+    hearts = [
+        (heart, fronds(head + 0.03 * forward - 0.05 * size * axis, axis, forward, wide, 0.5 * wide))
+        for axis in (side, other)
+    ]
+    return assemble(name, [(green, stems), (green, blades), (petal, petals), *hearts])
 
 
 def rock(seed: int, name: str, *, triangles: int, size: float, stone: int, flat: float = 0.7) -> SceneObject:

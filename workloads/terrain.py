@@ -38,6 +38,11 @@ def smoothstep(low: float, high: float, value: ArrayLike) -> F64:
     return np.asarray(t * t * (3.0 - 2.0 * t), np.float64)
 
 
+def unit(v: F64) -> F64:
+    """Return vectors (..., 3) scaled to length 1."""
+    return np.asarray(v / np.maximum(np.sqrt((v * v).sum(axis=-1, keepdims=True)), 1e-12), np.float64)
+
+
 class Noise:
     """Value noise on a periodic lattice of random numbers, summed over octaves (fractional Brownian motion)."""
 

@@ -103,3 +103,24 @@ def test_the_camera_sees_sky_and_scene(name, tmp_path):
     hit = np.isfinite(trace.column("t")[: trace.pixels]).mean()
     assert 0.6 < hit < 0.95
     assert 0.15 < trace.image().mean() < 0.8
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_plants_stand_on_the_ground(name):
+    # The oracle is Embree: a vertical ray through each foot meets the ground that is rendered, not a formula for it.
+    from embreex.mesh_construction import TriangleMesh
+    from embreex.rtcore_scene import EmbreeScene
+
+    scene = SCENES[name](detail=0.3)
+    ground = next(thing for thing in scene.objects if thing.name == "ground")
+    embree = EmbreeScene(robust=True)
+    for mesh in ground.meshes:
+        TriangleMesh(embree, mesh.vertices, mesh.faces)
+    names = np.array([thing.name for thing in scene.objects])[scene.instance_object]
+    feet = scene.instance_transform[~np.isin(names, ["ground", "sea", "lake"]), :, 3]
+    origins = (feet * [1, 1, 0] + [0, 0, 500]).astype(np.float32)
+    hits = embree.run(origins, np.tile(np.float32([0, 0, -1]), (len(feet), 1)), output=True)
+    assert (hits["primID"] >= 0).all()
+    depth = 500 - hits["tfar"] - feet[:, 2]
+    assert depth.min() > -1e-3  # nothing floats
+    assert depth.max() < 0.1  # or is buried
