@@ -238,6 +238,8 @@ def run(
         if timeline:
             write_timeline(timeline, result)
             _note(f"wrote {timeline}")
+    elif image or timeline:
+        _note("nothing was rendered, so no picture and no timeline were written")
     _note(f"simulated in {seconds:.2f} s")
     return 0 if result.feasible else 3
 
@@ -301,14 +303,19 @@ def _leaves(value: Any, path: tuple[str, ...]) -> list[tuple[str, Any]]:
 
 
 def _show_policy(name: str) -> None:
+    import dataclasses
     import inspect
 
     from simrender import catalog
+    from simrender.cards import written
 
     policy = catalog.find_policy(name)
     console = _console()
-    console.print(f"[bold]{name}[/bold]\n", highlight=False)
-    console.print(inspect.getdoc(policy) or "", highlight=False, markup=False)
+    console.print(f"[bold]{name}[/bold]\n")
+    console.print(inspect.getdoc(policy) or "", markup=False)
+    console.print("\nDefaults, changed by --set policy.NAME=VALUE\n--------")
+    for parameter in dataclasses.fields(policy):
+        console.print(f"{parameter.name} = {written(parameter.default)}", markup=False)
 
 
 class _Progress:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simrender.cards import UNCALIBRATED, Quantity
+from simrender.errors import InvariantError
 from simrender.hardware.machine import Machine
 from simrender.policies.frame import Frame
 from simrender.rays.kinds import KINDS, SHADOW
@@ -141,7 +142,10 @@ def breakdown(timeline: Timeline, frame_time_s: float) -> dict[str, float]:
         "shade": shares["shade"] + shares["generate"] + shares["tonemap"] + shares["assemble"],
         "copy": shares["copy"] + shares["merge"],
     }
-    return {**merged, "wait": max(0.0, 1.0 - sum(merged.values()))}
+    wait = 1.0 - sum(merged.values())
+    if wait < -1e-9:
+        raise InvariantError(f"the GPUs worked for {1.0 - wait:.3f} of the frame")
+    return {**merged, "wait": max(0.0, wait)}
 
 
 def counts(frame: Frame, machine: Machine) -> dict[str, float]:
@@ -159,9 +163,9 @@ def counts(frame: Frame, machine: Machine) -> dict[str, float]:
         "published_paths": int(kinds[0]) * weight,
         "published_rays": trace.rays * weight,
         "ray_weight": weight,
-        "bounces": trace.generations,
-        "ray_domain_tests": frame.tests,
-        "skipped_ray_domain_tests": frame.skipped_tests,
+        "generations": trace.generations,
+        "traced_ray_domain_tests": frame.tests,
+        "traced_skipped_ray_domain_tests": frame.skipped_tests,
         "kernels": int((kind < len(KERNELS)).sum()),
         "trace_kernels": int((kind == KERNELS.index("trace")).sum()),
         "copies": int((kind >= len(KERNELS)).sum()),

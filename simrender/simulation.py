@@ -12,14 +12,14 @@ import simpy
 from numpy.typing import NDArray
 
 from simrender.cards import Document
-from simrender.catalog import find_policy
+from simrender.catalog import find_policy, policies
 from simrender.clock import to_seconds
-from simrender.errors import InvariantError, UsageError
+from simrender.errors import InvariantError, UsageError, did_you_mean
 from simrender.hardware.machine import Machine, MachineCard, check_gpus, load_machine
 from simrender.policies.frame import Frame, Policy
-from simrender.policies.islands import Fit, fit
+from simrender.policies.islands import Fit, Layout, fit
 from simrender.policies.rank import Rank
-from simrender.rays.partition import Footprint, Method, Partition
+from simrender.rays.partition import Footprint, Partition
 from simrender.rays.trace import Progress, Trace
 from simrender.rays.workload import Workload, check_seed, load_workload
 from simrender.result import Result, breakdown, counts, owned_up, sampling_error, scope
@@ -75,7 +75,7 @@ def simulate(
         If a policy lost or repeated a ray, or made another image than the reference renderer.
 
     """
-    given = overrides or {}
+    given = _overrides(overrides or {}, machine, workload)
     card = load_machine(machine, given.get("machine", ())) if isinstance(machine, str) else machine
     count = check_gpus(card, gpus)
     if islands != "auto" and not 1 <= islands <= count:
@@ -105,17 +105,19 @@ def simulate(
         "memory": memory,
     }
     if not chosen.feasible:
-        return Result(**facts, uncalibrated=owned_up(list(workload.card.quantities("workload."))))
+        deciding = [*card.gpu.memory_quantities("machine.gpu."), *workload.card.quantities("workload.published.")]
+        cause = {"modelled": ["what each GPU must hold"], "left_out": [{"what": "the frame", "why": "it does not fit"}]}
+        return Result(**facts, uncalibrated=owned_up(deciding), scope=cause)
 
     env = simpy.Environment()
-    devices = Machine(env, card, layout.ranks)
+    devices = Machine(env, card, layout.ranks, kernels_read=scheduler.kernels_read)
     trace = workload.trace(seed, progress)
     frame = Frame(
         env, devices, layout, trace, partition, scheduler, Timeline(layout.ranks),
         visited=lambda generation, start: workload.crossings(seed, partition).domains_visited(generation, start),
         weight=workload.weight, published=workload.card.published.resolution,
     )  # fmt: skip
-    buffers = _buffers(scheduler, workload, layout.ranks)
+    buffers = _buffers(scheduler, workload, layout)
     ranks = []
     for index in range(layout.ranks):
         gpu = devices.processor(index)
@@ -129,6 +131,7 @@ def simulate(
     trace.complete()
     retired = np.concatenate(frame.retired)
     _check_retired(trace, retired)
+    _check_devices(frame, int(env.now))
     image = trace.image(np.sort(retired))
     image_sha256 = _hash(image)
     if image_sha256 != _hash(reference_image(trace)):
@@ -167,12 +170,27 @@ def reference_image(trace: Trace) -> NDArray[np.float32]:
     return trace.image(np.sort(np.concatenate(followed)))
 
 
+def _overrides(
+    overrides: Mapping[str, Sequence[str]], machine: str | MachineCard, workload: str | Workload
+) -> Mapping[str, Sequence[str]]:
+    """Refuse overrides that nobody would read."""
+    known = ("machine", "workload", "policy")
+    for section, assignments in overrides.items():
+        if section not in known:
+            raise UsageError(f"overrides of {section!r}: there are {', '.join(known)}{did_you_mean(section, known)}")
+        loaded = {"machine": not isinstance(machine, str), "workload": not isinstance(workload, str)}
+        if assignments and loaded.get(section):
+            raise UsageError(f"overrides of the {section} need its name, not one that is loaded already")
+    return overrides
+
+
 def _policy(policy: str | Policy | None, workload: Workload, overrides: Sequence[str]) -> tuple[str, Policy]:
     """Return the scheduler and its name: the card's own parameters hold where its own policy is asked for."""
     if policy is not None and not isinstance(policy, str):
         if overrides:
-            raise UsageError("overrides of a policy need its name, not an instance")
-        return type(policy).__name__, policy
+            raise UsageError("overrides of the policy need its name, not one that is made already")
+        home = f"{type(policy).__module__}:{type(policy).__qualname__}"
+        return next((name for name, entry in policies().items() if entry.value == home), home), policy
     own_name = workload.card.policy["name"]
     name = policy or own_name
     model = find_policy(name)
@@ -189,16 +207,14 @@ def _place(
 ) -> tuple[Fit, Partition, dict[str, Any]]:
     """Choose the islands, and say what each GPU must hold."""
     footprint = Footprint(float(card.gpu.bvh_triangle_bytes), float(card.gpu.bvh_instance_bytes))
-    method: Method = getattr(policy, "partition", "heaviest_first")
-    split_share = getattr(policy, "split_share", 1.0)
 
     def parts(size: int) -> Partition:
-        return workload.partition(size, footprint, method, split_share)
+        return workload.partition(size, footprint, policy.partition, policy.split_share)
 
     def need(count: int, size: int) -> NDArray[np.float64]:
         model = parts(size).weight_bytes[np.arange(count * size) % size]
         needed: NDArray[np.float64] = model + np.array(
-            [sum(b.values()) for b in _buffers(policy, workload, count * size)]
+            [sum(b.values()) for b in _buffers(policy, workload, Layout(count, size))]
         )
         return needed
 
@@ -212,17 +228,17 @@ def _place(
         "model_bytes": float(partition.weight_bytes[chosen.layout.domain(fullest)]),
         **{
             f"{what.replace(' ', '_')}_bytes": nbytes
-            for what, nbytes in _buffers(policy, workload, chosen.layout.ranks)[fullest].items()
+            for what, nbytes in _buffers(policy, workload, chosen.layout)[fullest].items()
         },
         "gpus_needed": chosen.gpus_needed,
     }
     return chosen, partition, memory
 
 
-def _buffers(policy: Policy, workload: Workload, ranks: int) -> list[dict[str, float]]:
+def _buffers(policy: Policy, workload: Workload, layout: Layout) -> list[dict[str, float]]:
     """Return what each rank allocates beside the model; rank 0 also assembles the finished frame."""
     width, height = workload.card.published.resolution
-    lines = np.bincount(np.arange(height) % ranks, minlength=ranks)
+    lines = np.bincount(layout.rank_of_line(np.arange(height)), minlength=layout.ranks)
     buffers = [policy.buffer_bytes(float(n) * width) for n in lines]
     buffers[0] = {**buffers[0], "assembled frame": 2.0 * 4.0 * width * height}
     return buffers
@@ -233,6 +249,22 @@ def _check_retired(trace: Trace, retired: NDArray[np.int64]) -> None:
     if len(times) > trace.rays or not (times == 1).all():
         lost, repeated = int((times == 0).sum()), int((times > 1).sum())
         raise InvariantError(f"of {trace.rays} rays {lost} were never retired and {repeated} more than once")
+
+
+def _check_devices(frame: Frame, end: int) -> None:
+    """Check that no GPU did two things at once or ran past the end, and that the links carried what was sent."""
+    log = frame.timeline
+    device, begins, ends = (np.array(column) for column in (log.device, log.start, log.end))
+    order = np.lexsort((ends, begins, device))
+    device, begins, ends = device[order], begins[order], ends[order]
+    together = (begins[1:] < ends[:-1]) & (device[1:] == device[:-1])
+    if together.any() or (begins > ends).any() or ends.max() > end:
+        raise InvariantError("a GPU did two things at once, or went on after the end of the frame")
+    if frame.machine.has_network:
+        network = frame.machine.network
+        carried = sum(b for name, b in network.carried_bytes.items() if str(name).endswith(".out"))
+        if abs(carried - network.sent_bytes) > 1e-12 * network.sent_bytes:
+            raise InvariantError(f"{network.sent_bytes} B were sent, but the links carried {carried} B")
 
 
 def _hash(image: NDArray[np.float32]) -> str:

@@ -472,7 +472,7 @@ def test_a_run_that_does_not_fit_exits_with_3_and_says_what_would_do(run_cli, ti
     assert ran.code == 3
     assert "tiny does not fit on dgx2 under ray_queue_cycling" in ran.out
     assert re.search(r"the fullest GPU would need 1\.3\d MB and has 1\.26 MB\.", ran.out)
-    assert "One island of 2 such GPUs would hold it." in ran.out
+    assert "2 such GPUs would do." in ran.out
 
 
 def test_the_gpus_that_are_needed_are_enough(run_cli, tiny_card):

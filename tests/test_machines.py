@@ -176,9 +176,11 @@ def test_a_machine_has_what_was_used_of_it(cards):
     assert not any(path.startswith("machine.nvlink") for path, _ in machine.quantities())
     machine.network.transfer(0, 1, 1.0)
     assert machine.has_network
-    assert [path for path, _ in machine.quantities() if path.startswith("machine.nvlink")] == [
-        f"machine.nvlink.{field}" for field in ("bandwidth", "duplex", "latency", "kernel_share")
-    ]
+    used = [path for path, _ in machine.quantities() if path.startswith("machine.nvlink")]
+    assert used == [f"machine.nvlink.{field}" for field in ("bandwidth", "duplex", "latency")]
+    reading = Machine(simpy.Environment(), cards["dgx2"], 16, kernels_read=True)
+    reading.network.transfer(0, (1, "kernel"), 1.0)
+    assert "machine.nvlink.kernel_share" in {path for path, _ in reading.quantities()}
 
 
 @pytest.mark.parametrize("gpus", [1, 2, 16])
@@ -310,11 +312,11 @@ def test_kernels_never_overlap_and_never_begin_before_they_are_issued(kernels):
     assert gpu.busy_ticks == sum(end - begin for begin, end in spans)
 
 
-def test_a_kernel_that_waits_for_data_keeps_its_gpu_busy(gpu):
+def test_a_kernel_that_waits_for_data_keeps_its_gpu_but_does_not_work(gpu):
     gpu.run(1e-6, 0)
     gpu.hold(1_500_000)
     gpu.hold(1_200_000)
-    assert (gpu.free_at, gpu.busy_ticks) == (1_500_000, 1_500_000)
+    assert (gpu.free_at, gpu.busy_ticks) == (1_500_000, 1_000_000)
 
 
 @pytest.fixture

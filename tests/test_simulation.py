@@ -105,12 +105,12 @@ def test_bytes_are_conserved(large):
 
 def test_occluded_shadow_rays_are_skipped_but_still_carried(large):
     counts = simulate("dgx2", large, islands=1).counts
-    assert counts["ray_domain_tests"] + counts["skipped_ray_domain_tests"] == counts["traced_rays"] * 16
+    assert counts["traced_ray_domain_tests"] + counts["traced_skipped_ray_domain_tests"] == counts["traced_rays"] * 16
     occluded = counts["traced_occluded_shadow_rays"]
-    assert 0 < counts["skipped_ray_domain_tests"] <= occluded * 15
+    assert 0 < counts["traced_skipped_ray_domain_tests"] <= occluded * 15
     one = simulate("dgx2", large, ImageParallel()).counts
-    assert one["ray_domain_tests"] == one["traced_rays"]
-    assert one["skipped_ray_domain_tests"] == 0
+    assert one["traced_ray_domain_tests"] == one["traced_rays"]
+    assert one["traced_skipped_ray_domain_tests"] == 0
 
 
 def test_spans_of_one_gpu_never_overlap(large):
@@ -141,7 +141,8 @@ def test_one_gpu_has_no_network_in_its_simulation(garden):
     assert result.counts["copies"] == 0
     assert [item["what"] for item in result.scope["left_out"]][-1] == "nvlink"
     assert not any(v["path"].startswith("machine.nvlink") for v in result.uncalibrated)
-    assert any(v["path"].startswith("machine.nvlink") for v in simulate("dgx2", garden, gpus=2, islands=1).uncalibrated)
+    paths = {v["path"] for v in simulate("rtx-server-a40", garden, gpus=2, islands=1).uncalibrated}
+    assert any(path.startswith("machine.pcie") for path in paths)
 
 
 def test_gpus_that_are_left_over_are_reported(garden):
@@ -157,7 +158,9 @@ def test_too_little_memory_is_infeasible_and_says_what_would_do(large):
     assert result.frame_time_s is None
     assert result.frames_per_s is None
     assert result.image_sha256 is None
-    needed = result.memory["gpus_needed"]
+    assert result.memory["gpus_needed"] % 8 == 0  # eight islands were asked for
+    assert "machine.gpu.reserved_memory" in {v["path"] for v in result.uncalibrated}
+    needed = simulate(card, large, islands=1).memory["gpus_needed"]
     assert result.memory["needed_bytes"] > result.memory["capacity_bytes"]
     assert needed > 0
     assert json.dumps(result.to_dict())
@@ -199,3 +202,49 @@ def test_a_faster_link_never_slows_the_frame_of_an_uncontended_ring(large):
     machines = [load_machine("dgx2", [f"nvlink.bandwidth={gb} GB/s"]) for gb in (20, 50, 145, 600)]
     times = [simulate(machine, large, islands=1).frame_time_s for machine in machines]
     assert times == sorted(times, reverse=True)
+
+
+def test_an_implicit_copy_sends_the_same_bytes_and_says_when_it_waits_for_them(large):
+    explicit, implicit = (
+        simulate("rtx-server-a40", large, RayQueueCycling(copy=c), islands=1) for c in ("explicit", "implicit")
+    )
+    assert implicit.counts["network_bytes"] == pytest.approx(explicit.counts["network_bytes"], rel=1e-12)
+    assert implicit.breakdown["copy"] > 0.2  # PCIe holds it back, and the kernels' waiting is not called tracing
+    assert max(implicit.utilization.values()) < 0.7
+    assert not any(v["path"] == "machine.pcie.kernel_share" for v in explicit.uncalibrated)
+    assert any(v["path"] == "machine.pcie.kernel_share" for v in implicit.uncalibrated)
+
+
+def test_a_kernel_reads_at_its_share_of_the_link(large):
+    # With tracing made free, an implicit step lasts as long as its transfer at the kernel's share of the link.
+    free = ["gpu.coherent_rate=1e9 Mray/s", "gpu.incoherent_rate=1e9 Mray/s"]
+    times = [
+        simulate(
+            load_machine("dgx2", [*free, f"nvlink.kernel_share={share}"]),
+            large,
+            RayQueueCycling(copy="implicit"),
+            islands=1,
+        )
+        for share in (0.2, 0.1)
+    ]
+    waiting = [r.breakdown["copy"] * r.frame_time_s for r in times]
+    assert waiting[1] / waiting[0] == pytest.approx(2, rel=0.05)
+
+
+def test_overrides_that_nobody_would_read_are_refused(garden):
+    for given, message in (
+        ({"machines": ["gpus=1"]}, "did you mean 'machine'"),
+        ({"workload": ["published.samples=1"]}, "overrides of the workload need its name"),
+    ):
+        with pytest.raises(UsageError, match=message):
+            simulate("dgx2", garden, overrides=given)
+    with pytest.raises(UsageError, match="overrides of the machine need its name"):
+        simulate(load_machine("dgx2"), garden, overrides={"machine": ["gpus=1"]})
+    assert simulate("dgx2", garden, RayQueueCycling()).policy == "ray_queue_cycling"
+
+
+def test_the_host_issues_one_phase_on_all_gpus_before_the_next(large):
+    table = simulate("dgx2", large, islands=1).timeline
+    assert table.kind[:16].tolist() == ["generate"] * 16
+    first_copies = table[table.kind == "copy"].head(16)
+    assert sorted(first_copies.device) == sorted(f"gpu{i}" for i in range(16))

@@ -114,11 +114,13 @@ class Machine:
     card : MachineCard
     gpus : int
         How many of its GPUs the simulation may use, from 0 on.
+    kernels_read : bool
+        Whether kernels will read their neighbours' memory.
 
     """
 
-    def __init__(self, env: simpy.Environment, card: MachineCard, gpus: int) -> None:
-        self.env, self.card, self.gpus = env, card, gpus
+    def __init__(self, env: simpy.Environment, card: MachineCard, gpus: int, *, kernels_read: bool = False) -> None:
+        self.env, self.card, self.gpus, self.kernels_read = env, card, gpus, kernels_read
         self.host = Host(env, card.host)
         self._processors: dict[int, Processor] = {}
 
@@ -143,7 +145,8 @@ class Machine:
         """The links between the GPUs, created when something is first sent.
 
         A copy takes the sender's outgoing lane, the receiver's incoming lane, and a share of each of the two GPUs'
-        ports, which cannot run both lanes at full speed at once.
+        ports, which cannot run both lanes at full speed at once. Where kernels read their neighbours' memory, the
+        routes ``i -> (j, "kernel")`` are those of the reads of GPU j.
         """
         fabric = self.card.fabric
         lane = float(fabric.bandwidth)
@@ -159,10 +162,15 @@ class Machine:
                 if i == j:
                     continue
                 route = [f"gpu{i}.out", f"gpu{i}.port", f"gpu{j}.port", f"gpu{j}.in"]
+                reach = lane
                 if fabric.distant and group_of[i] != group_of[j]:
-                    links[f"gpu{i}-gpu{j}"] = Link(lane * fabric.distant.share, 0.0)
+                    reach = lane * fabric.distant.share
+                    links[f"gpu{i}-gpu{j}"] = Link(reach, 0.0)
                     route.insert(2, f"gpu{i}-gpu{j}")
                 routes[i, j] = tuple(route)
+                if self.kernels_read:
+                    links[f"gpu{j}.reads.gpu{i}"] = Link(reach * fabric.kernel_share, 0.0)
+                    routes[i, (j, "kernel")] = (*route, f"gpu{j}.reads.gpu{i}")
         return Network(self.env, links, routes)
 
     def quantities(self) -> Iterator[tuple[str, Quantity]]:
@@ -173,7 +181,9 @@ class Machine:
         for name, quantity in card.host.quantities("machine.host."):
             yield name, quantity
         if self.has_network:
-            yield from card.fabric.quantities(f"machine.{card.fabric_name}.")
+            for name, quantity in card.fabric.quantities(f"machine.{card.fabric_name}."):
+                if self.kernels_read or not name.endswith(".kernel_share"):
+                    yield name, quantity
 
 
 def check_gpus(card: MachineCard, gpus: int | None) -> int:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import simpy
 from pydantic import model_validator
 
-from simrender.cards import Bandwidth, Card, Count, Duration, RayCount, RayRate, Size
+from simrender.cards import Bandwidth, Card, Count, Duration, Quantity, RayCount, RayRate, Size
 from simrender.clock import to_ticks
 from simrender.errors import ScheduleError
 
@@ -32,6 +32,11 @@ class ProcessorCard(Card):
     half_saturation: RayCount
     bvh_triangle_bytes: Size
     bvh_instance_bytes: Size
+
+    def memory_quantities(self, prefix: str) -> list[tuple[str, Quantity]]:
+        """Return the quantities that decide what fits, with their paths."""
+        names = ("memory", "reserved_memory", "bvh_triangle_bytes", "bvh_instance_bytes")
+        return [(f"{prefix}{name}", getattr(self, name)) for name in names]
 
     @model_validator(mode="after")
     def _leaves_memory(self) -> ProcessorCard:
@@ -127,10 +132,8 @@ class Processor:
         return begin, self.free_at
 
     def hold(self, until: int) -> None:
-        """Keep the last kernel running until a tick: it waits for data it reads from elsewhere."""
-        if until > self.free_at:
-            self.busy_ticks += until - self.free_at
-            self.free_at = until
+        """Keep the next kernel from starting before a tick: the last one still waits for data it reads."""
+        self.free_at = max(self.free_at, until)
 
 
 class Host:

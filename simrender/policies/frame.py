@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from simrender.hardware.machine import Machine
 from simrender.policies.islands import Layout, represented_lines
 from simrender.rays.kinds import CAMERA, SHADOW
-from simrender.rays.partition import Partition
+from simrender.rays.partition import Method, Partition
 from simrender.rays.trace import Ids, Trace
 from simrender.timeline import Timeline
 
@@ -36,8 +36,24 @@ class Policy(Protocol):
         """Whether every rank holds the whole model."""
 
     @property
+    def kernels_read(self) -> bool:
+        """Whether kernels read other ranks' memory, and not only copy engines."""
+
+    @property
     def first_domain(self) -> int:
         """How many ranks to the right of its own a ray is traced first."""
+
+    @property
+    def slots(self) -> int:
+        """How many rays a pixel a queue holds."""
+
+    @property
+    def partition(self) -> Method:
+        """How objects are dealt to the ranks of an island."""
+
+    @property
+    def split_share(self) -> float:
+        """The share of all triangles above which an object is split."""
 
     def buffer_bytes(self, pixels: float) -> dict[str, float]:
         """Return what a rank that renders so many pixels allocates beside the model, by name."""
@@ -149,8 +165,8 @@ class Frame:
     published: tuple[int, int]
     outbox: dict[tuple[int, int], RayQueue] = field(default_factory=dict)
     retired: list[Ids] = field(default_factory=list)
-    tests: float = 0.0
-    skipped_tests: float = 0.0
+    tests: int = 0
+    skipped_tests: int = 0
     wave_mean: float = 0.0
     wave_excess: float = 0.0
 

@@ -9,6 +9,7 @@ from pydantic import ConfigDict, Field
 
 from simrender.policies.frame import Steps
 from simrender.policies.rank import ACCUMULATED_BYTES, PIXEL_BYTES, Rank
+from simrender.rays.partition import Method
 
 
 @dataclass(frozen=True)
@@ -31,22 +32,26 @@ class ImageParallel:
     ray_bytes: Annotated[float, Field(gt=0)] = 88.0
 
     replicated: ClassVar[bool] = True
+    kernels_read: ClassVar[bool] = False
+    slots: ClassVar[int] = 2
+    partition: ClassVar[Method] = "heaviest_first"
+    split_share: ClassVar[float] = 1.0
     first_domain: ClassVar[int] = 0
 
     def buffer_bytes(self, pixels: float) -> dict[str, float]:
         """Return two queues of two rays a pixel, and the frame buffers."""
         return {
-            "ray queues": 2 * 2 * pixels * self.ray_bytes,
+            "ray queues": 2 * self.slots * pixels * self.ray_bytes,
             "frame buffers": pixels * (ACCUMULATED_BYTES + PIXEL_BYTES),
         }
 
     def rank(self, me: Rank) -> Steps:
         """Render this rank's scan lines, a path a pixel at a time."""
         for sample in range(me.samples):
-            rays = me.generate(sample, behind=me.no_rays())
+            rays = yield from me.generate(sample, behind=me.no_rays())
             while True:
-                me.trace(rays)
-                rays = me.shade(rays)
+                rays = yield from me.trace(rays)
+                rays = yield from me.shade(rays)
                 if (yield from me.read_own_counter(rays)) == 0:
                     break
         yield from me.merge_frame()

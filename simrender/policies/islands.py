@@ -89,7 +89,8 @@ class Fit:
     capacity_bytes : float
         Of one GPU.
     gpus_needed : int or None
-        The smallest number of such GPUs that would hold one island; None if no number up to 4,096 would.
+        The smallest number of such GPUs that would do, for the islands asked for or else for one; None if no number
+        up to 4,096 an island would.
 
     """
 
@@ -134,19 +135,20 @@ def fit(gpus: int, islands: int | None, need: Need, capacity_bytes: float, *, re
         size = next((k for k in range(1, gpus + 1) if holds(gpus // k, k)), gpus)
         layout = Layout(gpus // size, gpus // (gpus // size))
     needed = need(layout.islands, layout.size)
-    enough: int | None = layout.ranks
-    if not (needed <= capacity_bytes).all():
-        enough = None if replicated else _fewest(need, capacity_bytes)
+    if replicated:
+        enough = next((n for n in range(1, gpus + 1) if holds(n, 1)), None)
+    else:
+        enough = _fewest(need, islands or 1, capacity_bytes)
     return Fit(layout, needed, capacity_bytes, enough)
 
 
-def _fewest(need: Need, capacity_bytes: float) -> int | None:
-    """Return the fewest GPUs that hold the model in one island; more may be needed than there are, or none may do."""
+def _fewest(need: Need, islands: int, capacity_bytes: float) -> int | None:
+    """Return the fewest GPUs that hold the model in each of so many islands; more may be needed than there are."""
 
     def holds(size: int) -> bool:
-        return bool((need(1, size) <= capacity_bytes).all())
+        return bool((need(islands, size) <= capacity_bytes).all())
 
     if not holds(_SEARCH_LIMIT):
         return None  # a part that cannot be split is too large for any GPU
-    fewest = max(1, int(need(1, 1).sum() / capacity_bytes))
-    return next(size for size in range(fewest, _SEARCH_LIMIT + 1) if holds(size))
+    fewest = max(1, int(need(1, 1).sum() / capacity_bytes) // islands)
+    return islands * next(size for size in range(fewest, _SEARCH_LIMIT + 1) if holds(size))

@@ -12,6 +12,7 @@ import simpy
 
 from simrender.errors import InvariantError
 from simrender.policies.frame import Counts, Frame, RayQueue, Steps
+from simrender.rays.trace import Ids
 from simrender.timeline import COPIES, KERNELS
 
 GENERATE, TRACE, SHADE, TONEMAP, ASSEMBLE = range(len(KERNELS))
@@ -63,17 +64,20 @@ class Rank:
         """Return an empty queue."""
         return self._frame.queue(np.zeros(0, np.int64), self.index)
 
-    def generate(self, sample: int, behind: RayQueue) -> RayQueue:
+    def generate(self, sample: int, behind: RayQueue) -> Steps:
         """Write a wave of camera rays, one a pixel of this rank, into the queue behind the rays already there."""
+        yield from self._turn()
         frame = self._frame
         rays = frame.trace.camera_rays(sample, self._pixels)
         self._kernel(GENERATE, len(rays) * frame.policy.ray_bytes, len(rays))
-        return frame.queue(np.concatenate([behind.ids, rays]) if len(behind) else rays, self.index)
+        return self._queue(np.concatenate([behind.ids, rays]) if len(behind) else rays)
 
-    def trace(self, rays: RayQueue) -> None:
+    def trace(self, rays: RayQueue) -> Steps:
         """Trace a queue against this rank's domain; shadow rays already known to be occluded are skipped."""
+        yield from self._turn()
         begin, end, looking = self._trace(rays)
         self._frame.timeline.add(self.index, TRACE, begin, end, 0.0, looking)
+        return rays
 
     def _trace(self, rays: RayQueue) -> tuple[int, int, float]:
         """Run the trace kernel; return when it begins and ends, and the published rays that really looked for a hit."""
@@ -84,26 +88,40 @@ class Rank:
         frame.tests += rays.coherent + active
         frame.skipped_tests += skipped
         weight = frame.weight
-        seconds = self._gpu.trace_seconds(
-            rays.coherent * weight, active * weight, frame.partition.primitives[self.domain]
-        )
+        primitives = float(frame.partition.primitives[self.domain])
+        seconds = self._gpu.trace_seconds(rays.coherent * weight, active * weight, primitives)
         # A thread whose ray is done reads it and ends.
         seconds += skipped * weight * frame.policy.ray_bytes / self._gpu.card.memory_bandwidth
         begin, end = self._gpu.run(seconds, self._host.issue_launch())
         return begin, end, (rays.coherent + active) * weight
 
-    def shade(self, rays: RayQueue) -> RayQueue:
+    def shade(self, rays: RayQueue) -> Steps:
         """Shade the rays, add what they contribute to this rank's pixels, and return the rays they spawn."""
+        yield from self._turn()
         frame = self._frame
         if rays.stage != self.island_size and len(rays):
             raise InvariantError(f"rank {self.index} shades rays that saw {rays.stage} of {self.island_size} domains")
         if rays.home != self.index:
             raise InvariantError(f"rank {self.index} shades rays of rank {rays.home}")
         frame.retired.append(rays.ids)
-        spawned = frame.queue(frame.trace.children(rays.ids), self.index)
+        spawned = self._queue(frame.trace.children(rays.ids))
         nbytes = (len(rays) + len(spawned)) * frame.policy.ray_bytes + len(rays) * ACCUMULATED_BYTES
         self._kernel(SHADE, nbytes, len(rays))
         return spawned
+
+    def _queue(self, rays: Ids) -> RayQueue:
+        """Return rays as a queue of this rank, which must not hold more of them than it has slots."""
+        slots = self._frame.policy.slots * len(self._pixels)
+        if len(rays) > slots:
+            raise InvariantError(f"rank {self.index} has {len(rays)} rays for {slots} queue slots")
+        return self._frame.queue(rays, self.index)
+
+    def _turn(self) -> Steps:
+        """Let every rank that is at the same point issue its work first.
+
+        The host launches one phase on all GPUs before it goes on to the next (section 4.9).
+        """
+        yield self._frame.env.timeout(0)
 
     def _kernel(self, kind: int, traced_bytes: float, rays: int) -> None:
         weight = self._frame.weight
@@ -122,6 +140,7 @@ class Rank:
         frame = self._frame
         if self.island_size == 1:
             return rays
+        yield from self._turn()
         issued = self._host.issue_copy()
         begin = max(self._gpu.free_at, issued)
         nbytes = len(rays) * frame.policy.ray_bytes * frame.weight
@@ -145,19 +164,19 @@ class Rank:
         """
         frame = self._frame
         if self.island_size == 1:
-            self.trace(rays)
-            return rays
+            return (yield from self.trace(rays))
         frame.outbox[to, self._shifts] = rays
         yield from self.synchronize()
         rays = self._arrived()
         nbytes = len(rays) * frame.policy.ray_bytes * frame.weight
         begin, end, looking = self._trace(rays)
-        on_the_wire = nbytes / frame.machine.card.fabric.kernel_share
-        read = frame.machine.network.transfer(self.left, self.index, on_the_wire, start=begin)
+        read = frame.machine.network.transfer(self.left, (self.index, "kernel"), nbytes, start=begin)
         yield from self.synchronize(read)
-        end = max(end, _arrival(read))
-        self._gpu.hold(end)
         frame.timeline.add(self.index, TRACE, begin, end, nbytes, looking)
+        arrived = _arrival(read)
+        if arrived > end:  # the kernel has traced what it has and waits for the rest
+            self._gpu.hold(arrived)
+            frame.timeline.add(self.index, COPY, end, arrived, 0.0, 0.0)
         return rays
 
     # -- waiting --------------------------------------------------------------------------------------------------
@@ -201,6 +220,7 @@ class Rank:
 
     def merge_frame(self) -> Steps:
         """Tone-map this rank's pixels, copy them to rank 0, and let rank 0 put them in order (section 4.8)."""
+        yield from self._turn()
         frame = self._frame
         pixels = len(self._pixels)
         real = pixels * frame.weight
@@ -220,6 +240,7 @@ class Rank:
         if self.index == 0:
             yield from self.synchronize()
             return
+        yield from self._turn()
         begin = max(self._gpu.free_at, self._host.issue_copy())
         copy = frame.machine.network.transfer(self.index, 0, nbytes, start=begin)
         yield from self.synchronize(copy)

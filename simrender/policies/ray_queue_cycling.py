@@ -14,6 +14,9 @@ from simrender.policies.frame import RayQueue, Steps
 from simrender.policies.rank import ACCUMULATED_BYTES, PIXEL_BYTES, Rank
 from simrender.rays.partition import Method
 
+SPLIT_SHARE = 1 / 64
+"""Objects with more than this share of all triangles are big; the paper does not state its threshold."""
+
 
 @dataclass(frozen=True)
 class RayQueueCycling:
@@ -25,7 +28,9 @@ class RayQueueCycling:
         A copy engine moves each queue after its trace kernel, or the trace kernel itself reads the neighbour's queue
         (section 4.6). The paper's default is explicit.
     merging : bool
-        Start the next sample's wave as soon as the queues have room for it (section 4.10).
+        Start the next sample's wave as soon as the queues have room for it (section 4.10). Room is counted more
+        strictly than there: the queues must also hold what the rays may become in the next shade step, or rays would
+        be lost.
     slots : int
         Queue slots a pixel: two are what a path can fill, a third makes room for merging (sections 4.3 and 4.10).
     ray_bytes : float
@@ -45,9 +50,14 @@ class RayQueueCycling:
     slots: Annotated[int, Field(ge=2)] = 3
     ray_bytes: Annotated[float, Field(gt=0)] = 88.0
     partition: Method = "heaviest_first"
-    split_share: Annotated[float, Field(gt=0, le=1)] = 1 / 64
+    split_share: Annotated[float, Field(gt=0, le=1)] = SPLIT_SHARE
 
     replicated: ClassVar[bool] = False
+
+    @property
+    def kernels_read(self) -> bool:
+        """Whether trace kernels read their neighbour's queue."""
+        return self.copy == "implicit"
 
     @property
     def first_domain(self) -> int:
@@ -65,11 +75,11 @@ class RayQueueCycling:
         """Render one frame (section 4.9)."""
         rays = me.no_rays()
         for sample in range(me.samples):
-            rays = me.generate(sample, behind=rays)
+            rays = yield from me.generate(sample, behind=rays)
             last = sample == me.samples - 1
             while True:
                 rays = yield from self.distributed_trace(me, rays)
-                rays = me.shade(rays)
+                rays = yield from me.shade(rays)
                 active = yield from me.read_counters(rays)
                 if not active.any() or (self.merging and not last and active.room_for_a_wave(self.slots)):
                     break
@@ -81,6 +91,6 @@ class RayQueueCycling:
             if self.copy == "implicit":
                 rays = yield from me.trace_shifted(rays, me.right)
             else:
-                me.trace(rays)
+                rays = yield from me.trace(rays)
                 rays = yield from me.shift(rays, me.right)
         return rays

@@ -1,4 +1,4 @@
-"""The crossing table: which rays enter which domains, and what they hit there.
+"""The crossing table: which shadow rays enter which domains, and what they hit there.
 
 Rows are (ray, domain) pairs, grouped by ray and front to back within a ray. A row's hit is unknown (NaN) until somebody
 asks; then Embree traces the ray against that domain alone and the answer is kept, in memory and on disk. A scheduler
@@ -103,8 +103,13 @@ class Crossings:
 
     def _table(self, generation: int) -> Columns:
         if generation not in self._tables:
-            found = self.trace.store.load(self._name(generation))
-            if found is None or not {"ray", "first", "domain", "entry", "hit"} <= found.keys():
+            found = self.trace.store.load(self._name(generation), ("ray", "first", "domain", "entry", "hit"))
+            if found is not None and (
+                len(found["first"]) != len(found["ray"]) + 1
+                or {len(found[c]) for c in ("domain", "entry", "hit")} != {int(found["first"][-1])}
+            ):
+                found = None
+            if found is None:
                 found = self._enter(generation)
                 self._changed.add(generation)
             self._tables[generation] = found

@@ -61,8 +61,7 @@ def _from_mesh(loaded: Any, path: Path) -> Scene:
     if faces is None or len(faces) == 0:
         raise SceneError("the mesh is empty: it has no triangles")
     mesh = Mesh(np.asarray(loaded.vertices), np.asarray(faces))
-    parts = tuple(Mesh(*_compact(mesh, part)) for part in np.array_split(mesh.faces, _PARTS) if len(part))
-    thing = SceneObject(path.stem, parts)
+    thing = SceneObject(path.stem, _cut(mesh, _PARTS))
     return _lit((thing,), np.zeros(1, np.int32), IDENTITY[None], (_material(loaded),), path.suffix.lower() in _Y_UP)
 
 
@@ -82,12 +81,13 @@ def _from_graph(graph: Any) -> Scene:
     objects: list[SceneObject] = []
     materials: list[Material] = []
     index: dict[str, int] = {}
+    total = max(1, sum(len(getattr(geometry, "faces", ())) for geometry in graph.geometry.values()))
     for name, geometry in graph.geometry.items():
         if getattr(geometry, "faces", None) is None or len(geometry.faces) == 0:
             continue  # points and lines reflect nothing
         index[name] = len(objects)
         mesh = Mesh(np.asarray(geometry.vertices), np.asarray(geometry.faces), len(materials))
-        objects.append(SceneObject(str(name), (mesh,)))
+        objects.append(SceneObject(str(name), _cut(mesh, -(-len(mesh.faces) * _PARTS // total))))
         materials.append(_material(geometry))
     owner, transforms = [], []
     for node in graph.graph.nodes_geometry:
@@ -98,6 +98,12 @@ def _from_graph(graph: Any) -> Scene:
     if not owner:
         raise SceneError("the scene is empty: it has no triangles")
     return _lit(tuple(objects), np.array(owner, np.int32), np.array(transforms), tuple(materials), True)
+
+
+def _cut(mesh: Mesh, parts: int) -> tuple[Mesh, ...]:
+    """Cut a mesh into so many parts of about equally many consecutive faces."""
+    pieces = np.array_split(mesh.faces, parts)
+    return tuple(Mesh(*_compact(mesh, piece), mesh.material) for piece in pieces if len(piece))
 
 
 def _compact(mesh: Mesh, faces: Any) -> tuple[Any, Any]:

@@ -6,17 +6,29 @@ is read. A file that cannot be read is removed and computed again, with one warn
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 import warnings
 import zipfile
+from functools import cache
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 """Part of every key: raise it when the meaning of a stored column changes."""
+
+
+@cache
+def code_version() -> str:
+    """Return a hash of the code that decides what is stored: light transport, random numbers, and Embree's binding."""
+    digest = hashlib.blake2b(metadata.version("embreex").encode(), digest_size=8)
+    for name in ("shading.py", "sampling.py"):
+        digest.update((Path(__file__).parent / name).read_bytes())
+    return f"{FORMAT_VERSION}-{digest.hexdigest()}"
 
 
 class CacheWarning(UserWarning):
@@ -46,18 +58,40 @@ class Store:
         self.folder = (folder or default_folder()) / f"v{FORMAT_VERSION}" / key
         self._warned = False
 
-    def load(self, name: str) -> dict[str, Any] | None:
-        """Return the arrays stored under a name, or None if there are none or they are damaged."""
+    def load(self, name: str, columns: tuple[str, ...], rows: int | None = None) -> dict[str, Any] | None:
+        """Return the arrays stored under a name, or None if there are none or they are damaged.
+
+        Parameters
+        ----------
+        name : str
+        columns : tuple of str
+            What must be there.
+        rows : int, optional
+            How long each column must be.
+
+        """
         path = self.folder / f"{name}.npz"
         try:
             # Opened here and not by np.load, which leaves a damaged file open.
             with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
-                return {column: archive[column] for column in archive.files}
+                found = {column: archive[column] for column in columns}
+            if rows is not None and any(len(column) != rows for column in found.values()):
+                raise ValueError
+            return found
         except (FileNotFoundError, NotADirectoryError):
             return None
-        except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, zipfile.LargeZipFile) as error:
+        except (
+            OSError,
+            ValueError,
+            EOFError,
+            KeyError,
+            RuntimeError,
+            zipfile.BadZipFile,
+            zipfile.LargeZipFile,
+        ) as error:
             # NumPy's own words about a file that is no archive advise to load it unsafely.
-            reason = "not an archive of arrays" if isinstance(error, ValueError) else str(error) or "cut short"
+            reason = "not the arrays that belong there" if isinstance(error, (ValueError, KeyError)) else str(error)
+            reason = reason or "cut short"
             self._warn(f"the cache file {path} is damaged ({reason}); it is discarded and computed again")
             path.unlink(missing_ok=True)
             return None
@@ -73,9 +107,11 @@ class Store:
                 np.savez(file, allow_pickle=False, **columns)
             Path(temporary).chmod(0o644)
             Path(temporary).replace(path)
-        except OSError as error:
+        except BaseException as error:
             if temporary:
                 Path(temporary).unlink(missing_ok=True)
+            if not isinstance(error, OSError):
+                raise
             self._warn(f"cannot write the trace cache in {self.folder}: {error.strerror or error}; set SIMRENDER_CACHE")
 
     def _warn(self, message: str) -> None:
@@ -90,7 +126,7 @@ class NoStore(Store):
     def __init__(self) -> None:
         super().__init__("nowhere")
 
-    def load(self, name: str) -> None:  # noqa: ARG002
+    def load(self, name: str, columns: tuple[str, ...], rows: int | None = None) -> None:  # noqa: ARG002
         """Find nothing."""
         return
 

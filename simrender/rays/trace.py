@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 from simrender.rays import embree
 from simrender.rays.kinds import CAMERA, KINDS
 from simrender.rays.scene import Scene
-from simrender.rays.store import FORMAT_VERSION, NoStore, Store
+from simrender.rays.store import NoStore, Store, code_version
 
 if TYPE_CHECKING:
     from simrender.rays.shading import Bounces, Surfaces
@@ -105,7 +105,7 @@ class Trace:
         self.size, self.samples = size, samples
         self.bounces, self.seed, self.progress = bounces, seed, progress
         self.pixels = size[0] * size[1]
-        facts = f"{FORMAT_VERSION} {self.scene.key} {self.camera.tobytes().hex()} {size} {samples} {bounces} {seed}"
+        facts = f"{code_version()} {self.scene.key} {self.camera.tobytes().hex()} {size} {samples} {bounces} {seed}"
         self.key = hashlib.blake2b(facts.encode(), digest_size=16).hexdigest()
         self.store = Store(self.key, cache)
         self.traced_rays = 0
@@ -156,11 +156,6 @@ class Trace:
         while self._advance():
             pass
 
-    def generation_of(self, ray: int) -> int:
-        """Return the generation of a ray."""
-        self._know(ray)
-        return int(np.searchsorted(self.first, ray, side="right")) - 1
-
     def image(self, retired: Ids | None = None) -> NDArray[np.float32]:
         """Return the image that the retired rays make, float32 (height, width, 3): mean radiance of the samples.
 
@@ -186,9 +181,9 @@ class Trace:
         if generation == 0 and 0 not in self._geometry:
             self._geometry[0] = self._first_rays()  # made as fast as read, so they are not stored
         if generation not in self._geometry:
-            found = self.store.load(f"{generation:03d}-rays")
             rays = self.first[generation + 1] - self.first[generation]
-            if found is None or not _fits(found, GEOMETRY, rays):
+            found = self.store.load(f"{generation:03d}-rays", GEOMETRY, rays)
+            if found is None:
                 # Damaged since it was written: the same rays come out when they are traced again.
                 again = Trace(self.scene, self.camera, self.size, self.samples, self.bounces, self.seed)
                 again.store = NoStore()
@@ -232,9 +227,8 @@ class Trace:
         return True
 
     def _load(self, generation: int) -> Columns | None:
-        outcome = self.store.load(f"{generation:03d}-hits")
         expected = int(self._outcomes[-1]["children"].sum()) if generation else self.pixels * self.samples
-        return outcome if outcome and _fits(outcome, OUTCOME, expected) else None
+        return self.store.load(f"{generation:03d}-hits", OUTCOME, expected)
 
     def _trace(self, generation: int) -> Columns:
         from simrender.rays import shading
@@ -290,9 +284,9 @@ class Trace:
 
     def _spawned_rays(self, generation: int) -> Columns:
         if generation not in self._geometry:
-            found = self.store.load(f"{generation:03d}-rays")
             expected = int(self._outcomes[-1]["children"].sum())
-            if found is None or not _fits(found, GEOMETRY, expected):
+            found = self.store.load(f"{generation:03d}-rays", GEOMETRY, expected)
+            if found is None:
                 self._trace(generation - 1)
                 found = self._geometry[generation]
             self._geometry[generation] = found
@@ -308,7 +302,3 @@ def _handy(scene: Scene) -> float:
     low, high = scene.bounds
     size = float(np.linalg.norm(high.astype(np.float64) - low))
     return 1.0 if size == 0.0 or _HANDY[0] <= size <= _HANDY[1] else 2.0 ** round(math.log2(128.0 / size))
-
-
-def _fits(columns: Columns, names: tuple[str, ...], rows: int) -> bool:
-    return set(names) <= columns.keys() and all(len(columns[name]) == rows for name in names)

@@ -13,7 +13,9 @@ from simrender.units import format_bytes, format_count, format_seconds
 if TYPE_CHECKING:
     from simrender.result import Result
 
-_COLORS = {"trace": "green", "shade": "dark_green", "copy": "blue", "wait": "bright_black"}
+_BARS = {"trace": ("█", "green"), "shade": ("▓", "dark_green"), "copy": ("▒", "blue"), "wait": ("░", "bright_black")}
+"""Told apart without colours too."""
+
 _BAR = 48
 
 
@@ -25,12 +27,10 @@ def answer(result: Result) -> RenderableType:
     table.add_column(style="bold", no_wrap=True)
     table.add_column()
     time = result.frame_time_s or 0.0
-    error = result.sampling_error["relative_error"]
     rate = result.frames_per_s or 0.0
     figure = f"{rate:.3g}" if rate < 999.5 else f"{rate:,.0f}"
-    sampling = f" ± {100 * error:.2g} % (sampling)" if error else " (every pixel was traced)"
-    table.add_row("frame rate", Text(f"{figure} frames/s").append(sampling, style="not bold"), style="bold")
-    table.add_row("frame time", f"{format_seconds(time)}{sampling}")
+    table.add_row("frame rate", Text(f"{figure} frames/s").append(_sampling(result, 1), style="not bold"), style="bold")
+    table.add_row("frame time", format_seconds(time) + _sampling(result, -1))
     table.add_row("", _calibration(result))
     table.add_row("islands", _islands(result))
     table.add_row("memory", _memory(result))
@@ -39,6 +39,16 @@ def answer(result: Result) -> RenderableType:
     table.add_row("left out", Text("; ".join(item["what"] for item in result.scope["left_out"]), style="dim"))
     title = Text(f"{result.workload} on {result.machine} under {result.policy}", style="bold underline")
     return Group(title, table)
+
+
+def _sampling(result: Result, sign: int) -> str:
+    """Return the error of tracing fewer pixels: mostly the frame comes out too slow, so it has two sides."""
+    error = result.sampling_error
+    if not error["relative_error"]:
+        return " (every pixel was traced)"
+    either, slow = 100 * error["rays_relative_standard_error"], 100 * error["relative_error"]
+    less, more = (either, slow) if sign > 0 else (slow, either)
+    return f" (-{less:.1g} % to +{more:.1g} %, sampling)"
 
 
 def _calibration(result: Result) -> Text:
@@ -68,8 +78,9 @@ def _bar(breakdown: dict[str, float]) -> Text:
         covered += share
         cells = round(covered * _BAR) - drawn
         drawn += cells
-        text.append("█" * cells, style=_COLORS[name])
-    words = ", ".join(f"{name} {share:.0%}" for name, share in breakdown.items())
+        glyph, color = _BARS[name]
+        text.append(glyph * cells, style=color)
+    words = ", ".join(f"{_BARS[name][0]} {name} {share:.0%}" for name, share in breakdown.items())
     return text.append(f"\n{words}", style="default")
 
 
@@ -86,14 +97,13 @@ def _infeasible(result: Result) -> list[Any]:
     need, capacity = format_bytes(m["needed_bytes"]), format_bytes(m["capacity_bytes"])
     islands, gpus = ("s" if n != 1 else "" for n in (result.islands, result.island_size))
     size = f"{result.islands} island{islands} of {result.island_size} GPU{gpus}"
+    why = "one part of the model cannot be split" if result.island_size > 1 else "every GPU would hold all of it"
     lines = [
         Text(f"{result.workload} does not fit on {result.machine} under {result.policy}", style="bold red"),
         Text(f"In {size}, the fullest GPU would need {need} and has {capacity}."),
     ]
     if needed is None:
-        lines.append(
-            Text("No number of such GPUs would do: every GPU holds the whole model, or one part that cannot be split.")
-        )
+        lines.append(Text(f"No number of such GPUs would do: {why}."))
     else:
-        lines.append(Text(f"One island of {needed} such GPUs would hold it."))
+        lines.append(Text(f"{needed} such GPUs would do."))
     return lines

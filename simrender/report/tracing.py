@@ -9,6 +9,7 @@ import numpy as np
 from rich.console import RenderableType
 from rich.table import Table
 
+from simrender.policies.ray_queue_cycling import SPLIT_SHARE
 from simrender.rays import embree
 from simrender.rays.kinds import KINDS, SHADOW
 from simrender.rays.partition import Footprint
@@ -48,7 +49,7 @@ def describe_rays(name: str, trace: Trace) -> RenderableType:
     table.add_row("all", f"{trace.rays:,}", f"{int(hit.sum()):,}", f"{hit.mean():.1%}")
     scene = trace.scene
     table.caption = (
-        f"{trace.generations} bounces; {len(scene.objects)} objects, {len(scene.instance_object):,} instances, "
+        f"{trace.generations} generations; {len(scene.objects)} objects, {len(scene.instance_object):,} instances, "
         f"{scene.unique_triangles:,} triangles, {scene.instanced_triangles:,} with instances\n"
     )
     return table
@@ -60,7 +61,7 @@ def describe_domains(workload: Workload, trace: Trace, domains: int) -> Renderab
     Sizes are published ones. What a machine's acceleration structures add to the bytes is on the machine's card, so it
     is left out here.
     """
-    parts = workload.partition(domains, Footprint(0.0, 0.0), "heaviest_first", 1 / 64)
+    parts = workload.partition(domains, Footprint(0.0, 0.0), "heaviest_first", SPLIT_SHARE)
     primitive = trace.column("primitive")
     domain = parts.domain_of_mesh[trace.scene.triangles.mesh[primitive[primitive >= 0]]]
     hits = np.bincount(domain, minlength=domains)
@@ -84,10 +85,10 @@ def describe_speed(trace: Trace, seconds: float, clock: Callable[[], float]) -> 
         Returns wall time in seconds.
 
     """
+    alone = trace.rays / raw_embreex_seconds(trace, clock) / 1e6
     if trace.traced_rays == 0:
-        return "every ray came from the cache"
-    raw = raw_embreex_seconds(trace, clock)
-    tables, alone = trace.traced_rays / seconds / 1e6, trace.rays / raw / 1e6
+        return f"every ray came from the cache; {alone:.2f} Mray/s by embreex alone"
+    tables = trace.traced_rays / seconds / 1e6
     return f"{tables:.2f} Mray/s through the tables and onto the disk; {alone:.2f} Mray/s by embreex alone"
 
 

@@ -23,10 +23,10 @@ class DropsASample(RayQueueCycling):
 @dataclass(frozen=True)
 class StopsEarly(RayQueueCycling):
     def rank(self, me):
-        rays = me.generate(0, behind=me.no_rays())
-        me.trace(rays)
+        rays = yield from me.generate(0, behind=me.no_rays())
+        rays = yield from me.trace(rays)
         rays = yield from me.shift(rays, me.right)
-        me.shade(rays)
+        yield from me.shade(rays)
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,26 @@ class ForgetsADomain(RayQueueCycling):
 @dataclass(frozen=True)
 class RepeatsASample(RayQueueCycling):
     def rank(self, me):
-        rays = me.generate(0, behind=me.no_rays())
+        rays = yield from me.generate(0, behind=me.no_rays())
         rays = yield from self.distributed_trace(me, rays)
-        me.shade(rays)
+        yield from me.shade(rays)
         yield from super().rank(me)
+
+
+@dataclass(frozen=True)
+class MergesWithoutRoom(RayQueueCycling):
+    def rank(self, me):
+        rays = me.no_rays()
+        for sample in range(me.samples):
+            rays = yield from me.generate(sample, behind=rays)
+            rays = yield from self.distributed_trace(me, rays)
+            rays = yield from me.shade(rays)
 
 
 @pytest.mark.parametrize(
     ("policy", "message"),
     [
+        (MergesWithoutRoom(slots=2), r"rank \d has \d+ rays for \d+ queue slots"),
         (DropsASample(), r"of \d+ rays \d+ were never retired and 0 more than once"),
         (StopsEarly(), r"rank \d shades rays that saw 1 of 2 domains"),
         (ForgetsADomain(), r"rank \d shades rays that saw 0 of 2 domains"),
