@@ -79,7 +79,8 @@ def landscape(*, seed: int = 1, detail: float = 1.0) -> Scene:
     Returns
     -------
     Scene
-        About 0.7 M instanced triangles at ``detail=1``. z is up, units are metres; meant to be seen from (0, 0, 5.5).
+        About 0.7 M instanced triangles at ``detail=1``. z is up, units are metres; meant to be seen from
+        (0, 0, 4.2), towards positive y.
 
     """
     cells = max(16, round(140 * float(np.sqrt(detail))))
