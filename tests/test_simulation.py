@@ -248,3 +248,12 @@ def test_the_host_issues_one_phase_on_all_gpus_before_the_next(large):
     assert table.kind[:16].tolist() == ["generate"] * 16
     first_copies = table[table.kind == "copy"].head(16)
     assert sorted(first_copies.device) == sorted(f"gpu{i}" for i in range(16))
+
+
+@pytest.mark.parametrize("size", ["1x1", "2x2", "5x3", "300x1"])
+@pytest.mark.parametrize("policy", ["ray_queue_cycling", "image_parallel"])
+def test_images_with_fewer_scan_lines_than_gpus(tmp_path, size, policy):
+    result = simulate("dgx2", garden_workload(size, size, cache=tmp_path), policy)
+    width, height = map(int, size.split("x"))
+    assert result.counts["traced_paths"] == width * height * 2
+    assert len(result.utilization) == 16

@@ -3,6 +3,9 @@
 A ray's random numbers depend on where it stands in the tree of rays and on nothing else, so a scheduler may trace rays
 in any order, twice, or on any number of threads and always gets the same ones. The hash is the finalizer of
 SplitMix64 (Steele, Lea and Flood, "Fast splittable pseudorandom number generators", OOPSLA 2014).
+
+Numba keeps a compiled kernel until the kernel's own file changes: whoever edits this file must touch ``shading.py``
+too, or the shading kernel goes on with the old functions.
 """
 
 from __future__ import annotations
