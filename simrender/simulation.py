@@ -18,7 +18,7 @@ from simrender.errors import InvariantError, UsageError, did_you_mean
 from simrender.hardware.machine import Machine, MachineCard, check_gpus, load_machine
 from simrender.policies.frame import Frame, Policy
 from simrender.policies.islands import Fit, Layout, fit
-from simrender.policies.rank import Rank
+from simrender.policies.rank import PIXEL_BYTES, Rank
 from simrender.rays.partition import Footprint, Partition
 from simrender.rays.trace import Progress, Trace
 from simrender.rays.workload import Workload, check_seed, load_workload
@@ -117,12 +117,12 @@ def simulate(
         visited=lambda generation, start: workload.crossings(seed, partition).domains_visited(generation, start),
         weight=workload.weight, published=workload.card.published.resolution,
     )  # fmt: skip
-    buffers = _buffers(scheduler, workload, layout)
+    cases, which = _buffers(scheduler, workload, layout)
     ranks = []
     for index in range(layout.ranks):
         gpu = devices.processor(index)
         gpu.allocate("the model", float(partition.weight_bytes[layout.domain(index)]))
-        for what, nbytes in buffers[index].items():
+        for what, nbytes in cases[which[index]].items():
             gpu.allocate(what, nbytes)
         ranks.append(env.process(scheduler.rank(Rank(frame, index))))
     env.run(env.all_of(ranks))
@@ -134,7 +134,7 @@ def simulate(
     _check_devices(frame, int(env.now))
     image = trace.image(np.sort(retired))
     image_sha256 = _hash(image)
-    if image_sha256 != _hash(reference_image(trace)):
+    if image_sha256 != _hash(trace.reference):
         raise InvariantError(f"{name} rendered another image than the reference renderer")
     if layout.size > 1:
         workload.crossings(seed, partition).save()
@@ -154,20 +154,6 @@ def simulate(
         image=image,
         spans=frame.timeline,
     )
-
-
-def reference_image(trace: Trace) -> NDArray[np.float32]:
-    """Return what a renderer with one domain makes: it follows the rays of each sample from the camera to their ends.
-
-    This is the truth that every policy must reproduce bit for bit.
-    """
-    followed = []
-    for sample in range(trace.samples):
-        rays = trace.camera_rays(sample, np.arange(trace.pixels))
-        while len(rays):
-            followed.append(rays)
-            rays = trace.children(rays)
-    return trace.image(np.sort(np.concatenate(followed)))
 
 
 def _overrides(
@@ -213,35 +199,37 @@ def _place(
 
     def need(count: int, size: int) -> NDArray[np.float64]:
         model = parts(size).weight_bytes[np.arange(count * size) % size]
-        needed: NDArray[np.float64] = model + np.array(
-            [sum(b.values()) for b in _buffers(policy, workload, Layout(count, size))]
-        )
+        distinct, which = _buffers(policy, workload, Layout(count, size))
+        needed: NDArray[np.float64] = model + np.array([sum(b.values()) for b in distinct])[which]
         return needed
 
     capacity = float(card.gpu.memory - card.gpu.reserved_memory)
     chosen = fit(gpus, None if islands == "auto" else islands, need, capacity, replicated=policy.replicated)
     partition = parts(chosen.layout.size)
     fullest = int(chosen.needed_bytes.argmax())
+    distinct, which = _buffers(policy, workload, chosen.layout)
     memory = {
         "needed_bytes": float(chosen.needed_bytes[fullest]),
         "capacity_bytes": capacity,
         "model_bytes": float(partition.weight_bytes[chosen.layout.domain(fullest)]),
-        **{
-            f"{what.replace(' ', '_')}_bytes": nbytes
-            for what, nbytes in _buffers(policy, workload, chosen.layout)[fullest].items()
-        },
+        **{f"{what.replace(' ', '_')}_bytes": nbytes for what, nbytes in distinct[which[fullest]].items()},
         "gpus_needed": chosen.gpus_needed,
     }
     return chosen, partition, memory
 
 
-def _buffers(policy: Policy, workload: Workload, layout: Layout) -> list[dict[str, float]]:
-    """Return what each rank allocates beside the model; rank 0 also assembles the finished frame."""
+def _buffers(policy: Policy, workload: Workload, layout: Layout) -> tuple[list[dict[str, float]], NDArray[np.int64]]:
+    """Return what ranks allocate beside the model: the distinct cases, and which of them each rank is.
+
+    Ranks differ by a scan line at most, and rank 0 also assembles the finished frame.
+    """
     width, height = workload.card.published.resolution
     lines = np.bincount(layout.rank_of_line(np.arange(height)), minlength=layout.ranks)
-    buffers = [policy.buffer_bytes(float(n) * width) for n in lines]
-    buffers[0] = {**buffers[0], "assembled frame": 2.0 * 4.0 * width * height}
-    return buffers
+    counts, which = np.unique(lines, return_inverse=True)
+    cases = [policy.buffer_bytes(float(n) * width) for n in (*counts, lines[0])]
+    cases[-1]["assembled frame"] = 2.0 * PIXEL_BYTES * width * height
+    which[0] = len(counts)
+    return cases, which
 
 
 def _check_retired(trace: Trace, retired: NDArray[np.int64]) -> None:

@@ -9,7 +9,7 @@ import re
 import pytest
 from PIL import Image
 
-from simrender.report.files import write
+from simrender.files import write
 
 # Results
 

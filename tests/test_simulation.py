@@ -15,7 +15,6 @@ from simrender import load_machine, simulate
 from simrender.errors import UsageError
 from simrender.policies.image_parallel import ImageParallel
 from simrender.policies.ray_queue_cycling import RayQueueCycling
-from simrender.simulation import reference_image
 from tests.scenes import garden_workload
 
 LARGE = {"published": "1920x1280", "traced": "96x64"}
@@ -37,7 +36,7 @@ def large(tmp_path_factory):
 def test_every_schedule_renders_the_reference_image(garden, islands, copy, merging):
     result = simulate("dgx2", garden, RayQueueCycling(copy=copy, merging=merging), islands=islands)
     assert result.image_sha256 == simulate("dgx2", garden, ImageParallel()).image_sha256
-    assert (result.image == reference_image(garden.trace())).all()
+    assert (result.image == garden.trace().reference).all()
 
 
 def test_the_same_run_gives_the_same_log_and_another_seed_another(garden):

@@ -189,8 +189,8 @@ class Frame:
 
     def visits(self, rays: Ids) -> NDArray[np.int16]:
         """Return how many domains each ray is traced in."""
-        start = (self.owner + self.policy.first_domain) % self.layout.size
         while len(self._joined) <= int(rays.max()):
+            start = (self.owner + self.policy.first_domain) % self.layout.size
             self._visits.append(self.visited(len(self._visits), start))
             self._joined = np.concatenate(self._visits)
         return self._joined[rays]

@@ -69,7 +69,7 @@ class Rank:
         yield from self._turn()
         frame = self._frame
         rays = frame.trace.camera_rays(sample, self._pixels)
-        self._kernel(GENERATE, len(rays) * frame.policy.ray_bytes, len(rays))
+        self._kernel(GENERATE, len(rays) * frame.policy.ray_bytes * frame.weight, len(rays) * frame.weight)
         return self._queue(np.concatenate([behind.ids, rays]) if len(behind) else rays)
 
     def trace(self, rays: RayQueue) -> Steps:
@@ -106,7 +106,7 @@ class Rank:
         frame.retired.append(rays.ids)
         spawned = self._queue(frame.trace.children(rays.ids))
         nbytes = (len(rays) + len(spawned)) * frame.policy.ray_bytes + len(rays) * ACCUMULATED_BYTES
-        self._kernel(SHADE, nbytes, len(rays))
+        self._kernel(SHADE, nbytes * frame.weight, len(rays) * frame.weight)
         return spawned
 
     def _queue(self, rays: Ids) -> RayQueue:
@@ -123,11 +123,10 @@ class Rank:
         """
         yield self._frame.env.timeout(0)
 
-    def _kernel(self, kind: int, traced_bytes: float, rays: int) -> None:
-        weight = self._frame.weight
-        seconds = self._gpu.stream_seconds(traced_bytes * weight)
-        begin, end = self._gpu.run(seconds, self._host.issue_launch())
-        self._frame.timeline.add(self.index, kind, begin, end, traced_bytes * weight, rays * weight)
+    def _kernel(self, kind: int, nbytes: float, rays: float) -> None:
+        """Run a kernel that is bound by the published bytes it moves."""
+        begin, end = self._gpu.run(self._gpu.stream_seconds(nbytes), self._host.issue_launch())
+        self._frame.timeline.add(self.index, kind, begin, end, nbytes, rays)
 
     # -- moving rays ----------------------------------------------------------------------------------------------
 
@@ -222,17 +221,12 @@ class Rank:
         """Tone-map this rank's pixels, copy them to rank 0, and let rank 0 put them in order (section 4.8)."""
         yield from self._turn()
         frame = self._frame
-        pixels = len(self._pixels)
-        real = pixels * frame.weight
-        seconds = self._gpu.stream_seconds(real * (ACCUMULATED_BYTES + PIXEL_BYTES))
-        begin, end = self._gpu.run(seconds, self._host.issue_launch())
-        frame.timeline.add(self.index, TONEMAP, begin, end, real * (ACCUMULATED_BYTES + PIXEL_BYTES), 0.0)
+        pixels = len(self._pixels) * frame.weight
+        self._kernel(TONEMAP, pixels * (ACCUMULATED_BYTES + PIXEL_BYTES), 0.0)
         if frame.layout.ranks > 1:
-            yield from self._gather(real * PIXEL_BYTES)
+            yield from self._gather(pixels * PIXEL_BYTES)
         if self.index == 0:
-            nbytes = 2.0 * PIXEL_BYTES * frame.published[0] * frame.published[1]
-            begin, end = self._gpu.run(self._gpu.stream_seconds(nbytes), self._host.issue_launch())
-            frame.timeline.add(0, ASSEMBLE, begin, end, nbytes, 0.0)
+            self._kernel(ASSEMBLE, 2.0 * PIXEL_BYTES * frame.published[0] * frame.published[1], 0.0)
         yield from self.synchronize()
 
     def _gather(self, nbytes: float) -> Steps:

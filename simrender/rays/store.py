@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import tempfile
 import warnings
 import zipfile
 from functools import cache
@@ -17,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from simrender.files import write
 
 FORMAT_VERSION = 2
 """Part of every key: raise it when the meaning of a stored column changes."""
@@ -98,20 +99,10 @@ class Store:
 
     def save(self, name: str, columns: dict[str, Any]) -> None:
         """Store arrays under a name; a folder that cannot be written costs a warning, not the run."""
-        path = self.folder / f"{name}.npz"
-        temporary = ""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            handle, temporary = tempfile.mkstemp(dir=self.folder, prefix=f".{name}-")
-            with os.fdopen(handle, "wb") as file:
-                np.savez(file, allow_pickle=False, **columns)
-            Path(temporary).chmod(0o644)
-            Path(temporary).replace(path)
-        except BaseException as error:
-            if temporary:
-                Path(temporary).unlink(missing_ok=True)
-            if not isinstance(error, OSError):
-                raise
+            write(self.folder / f"{name}.npz", lambda file: np.savez(file, allow_pickle=False, **columns))
+        except OSError as error:
             self._warn(f"cannot write the trace cache in {self.folder}: {error.strerror or error}; set SIMRENDER_CACHE")
 
     def _warn(self, message: str) -> None:

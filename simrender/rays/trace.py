@@ -175,6 +175,20 @@ class Trace:
         image = np.stack(sums, axis=1) / self.samples
         return image.reshape(self.size[1], self.size[0], 3).astype(np.float32)
 
+    @cached_property
+    def reference(self) -> NDArray[np.float32]:
+        """What a renderer with one domain makes: it follows the rays of each sample from the camera to their ends.
+
+        This is the truth that every policy must reproduce bit for bit.
+        """
+        followed = []
+        for sample in range(self.samples):
+            rays = self.camera_rays(sample, np.arange(self.pixels))
+            while len(rays):
+                followed.append(rays)
+                rays = self.children(rays)
+        return self.image(np.sort(np.concatenate(followed)))
+
     def geometry(self, generation: int) -> Columns:
         """Return the geometry columns of one generation."""
         self._know(self.first[generation])

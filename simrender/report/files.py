@@ -1,11 +1,9 @@
-"""Writing results to files: atomically, and only after the folder is known to be there."""
+"""Writing results to files, after the folder is known to be there."""
 
 from __future__ import annotations
 
 import json
 import os
-import tempfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -13,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simrender.errors import UsageError
+from simrender.files import write
 
 if TYPE_CHECKING:
     from simrender.result import Result
@@ -35,19 +34,6 @@ def check_target(option: str, path: Path, endings: tuple[str, ...]) -> None:
         raise UsageError(f"{option} {path}: there is no folder {path.parent}")
     if not os.access(path.parent, os.W_OK):
         raise UsageError(f"{option} {path}: the folder {path.parent} cannot be written")
-
-
-def write(path: Path, content: Callable[[BinaryIO], None]) -> None:
-    """Let ``content`` write a file, and put it in place only when it is whole."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            content(file)
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
 
 
 def write_json(path: Path, value: Any) -> None:

@@ -18,18 +18,10 @@ from simrender.clock import TICKS_PER_SECOND, to_ticks
 from simrender.errors import ScheduleError, UnreachableError, UsageError
 from simrender.hardware import network
 from simrender.hardware.network import Link, Network, max_min_rates
+from tests.flows import finishes
 
 SECOND = TICKS_PER_SECOND
 check = settings(deadline=None, derandomize=True, max_examples=100)
-
-
-def finishes(links, routes, flows):
-    """Run (source, target, bytes, start tick) flows, declared in this order; return their ticks and the network."""
-    env = simpy.Environment()
-    net = Network(env, links, routes)
-    done = [net.transfer(source, target, nbytes, start=start) for source, target, nbytes, start in flows]
-    env.run()
-    return [event.value for event in done], net
 
 
 def one_link(bandwidth, latency=0.0):

@@ -3,21 +3,12 @@
 from typing import NamedTuple
 
 import pytest
-import simpy
 
 from simrender.clock import TICKS_PER_SECOND, to_ticks
-from simrender.hardware.network import Link, Network
+from simrender.hardware.network import Link
+from tests.flows import finishes
 
 SECOND = TICKS_PER_SECOND
-
-
-def finishes(links, routes, flows):
-    """Run (source, target, bytes, start tick) flows, declared in this order; return their ticks and the network."""
-    env = simpy.Environment()
-    net = Network(env, links, routes)
-    done = [net.transfer(source, target, nbytes, start=start) for source, target, nbytes, start in flows]
-    env.run()
-    return [event.value for event in done], net
 
 
 class Star(NamedTuple):
