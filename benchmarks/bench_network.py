@@ -7,7 +7,8 @@ import math
 
 import simpy
 
-from simrender.hardware.network import Link, Network, max_min_rates
+from simrender.hardware.maxmin import max_min_rates
+from simrender.hardware.network import Link, Network
 
 GPUS = 16
 STAGES = 100

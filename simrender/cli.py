@@ -22,7 +22,6 @@ from simrender.errors import SimrenderError, UsageError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from simrender.cards import Document
     from simrender.result import Result
 
 app = App(
@@ -63,24 +62,27 @@ def list_(kind: Literal["machines", "workloads", "policies"] | None = None, /) -
     from rich.text import Text
 
     from simrender import catalog
+    from simrender.report.cards import titles
 
-    def title(name: str, card: catalog.CardFile | None) -> str:
+    def rows(name: str, card: catalog.CardFile | None) -> list[tuple[str, str]]:
         try:
             if card is not None:
-                return str(card.document().data.get("title", ""))
-            return (catalog.find_policy(name).__doc__ or "").partition("\n")[0]
+                return titles(card)
+            return [(name, (catalog.find_policy(name).__doc__ or "").partition("\n")[0])]
         except SimrenderError as error:  # one broken card or plug-in hides no other
             warnings.warn(str(error), stacklevel=2)
-            return "broken"
+            return [(name, "broken")]
 
     for which in ("machines", "workloads", "policies") if kind is None else (kind,):
         table = Table.grid(padding=(0, 2))
+        table.add_column(no_wrap=True)
         found: dict[str, catalog.CardFile | None] = (
             dict.fromkeys(catalog.policies()) if which == "policies"
             else {**catalog.cards("machine" if which == "machines" else "workload")}
         )  # fmt: skip
         for name, card in found.items():
-            table.add_row(name, Text(title(name, card)))
+            for row, (shown, title) in enumerate(rows(name, card)):
+                table.add_row(Text(shown), Text(title), style="dim" if row else "")  # variants follow their card
         console = _console()
         console.print(f"[bold]{which}[/bold]")
         console.print(table)
@@ -93,21 +95,24 @@ def show(name: str, /) -> None:
     Parameters
     ----------
     name
-        Of a machine, a workload or a policy, or the path of a card.
+        Of a machine, a workload or a policy, or the path of a card; NAME:VARIANT shows a variant of a card.
 
     """
     from simrender import catalog
     from simrender.errors import UnknownNameError
+    from simrender.report.cards import describe_card
 
-    machines, workloads, policies = catalog.cards("machine"), catalog.cards("workload"), catalog.policies()
+    policies = catalog.policies()
     if name in policies:
         _show_policy(name)
-    elif name in machines or name in workloads:
-        _show_card((machines | workloads)[name].document())
-    elif Path(name).is_file():
-        _show_card(catalog.find_card("machine", name).document())
-    else:
-        raise UnknownNameError("machine, workload or policy", name, [*machines, *workloads, *policies])
+        return
+    try:
+        card = catalog.find_card(None, name)
+    except UnknownNameError:
+        known = [*catalog.cards("machine"), *catalog.cards("workload"), *policies]
+        raise UnknownNameError("machine, workload or policy", name, known) from None
+    console = _console()
+    console.print(describe_card(card, console.width))
 
 
 @app.command
@@ -267,39 +272,6 @@ def _islands(text: str) -> int | Literal["auto"]:
         return int(text)
     except ValueError:
         raise UsageError(f"--islands {text}: expected a number of islands, or auto") from None
-
-
-def _show_card(document: Document) -> None:
-    from rich.padding import Padding
-    from rich.text import Text
-
-    from simrender.cards import written
-
-    console = _console()
-    title = Text(str(document.data.get("title", "")), style="bold")
-    console.print(title, Text(f"{document.where}\n", style="dim"), sep="\n")
-    leaves = _leaves(document.data, ())
-    width = max((len(path) for path, _ in leaves), default=0)
-    for path, value in leaves:
-        plain = value if not isinstance(value, dict) else value["value"]
-        line = Text(f"{path:<{width}}  ", style="bold").append(written(plain), style="not bold")
-        if isinstance(value, dict):
-            bounds = value.get("range")
-            between = f" ({' to '.join(written(v) for v in bounds)})" if isinstance(bounds, list) else ""
-            status = str(value.get("status", "stated"))
-            line.append(between, style="not bold")
-            line.append(
-                f"  {status}", style="not bold yellow" if status in {"assumed", "calibrated"} else "not bold green"
-            )
-        console.print(line)
-        if isinstance(value, dict) and value.get("source"):
-            console.print(Padding(Text(str(value["source"]), style="dim"), (0, 0, 0, width + 2)))
-
-
-def _leaves(value: Any, path: tuple[str, ...]) -> list[tuple[str, Any]]:
-    if isinstance(value, dict) and "value" not in value:
-        return [leaf for key, inner in value.items() for leaf in _leaves(inner, (*path, str(key)))]
-    return [(".".join(path), value)]
 
 
 def _show_policy(name: str) -> None:

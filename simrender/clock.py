@@ -14,7 +14,7 @@ from simrender.errors import ScheduleError
 TICKS_PER_SECOND = 10**12
 """One tick is a picosecond."""
 
-_NOISE = 4.0 * 2.0**-53
+TICK_NOISE = 4.0 * 2.0**-53
 """Relative: half a unit in the last place each of a duration and of its product, with as much to spare."""
 
 
@@ -37,7 +37,7 @@ def to_ticks(seconds: float) -> int:
     ticks = seconds * TICKS_PER_SECOND
     whole = round(ticks)
     # 0.1 us is 100000 ticks: what two roundings of a float add is no time, and would break ties.
-    return whole if math.isclose(ticks, whole, rel_tol=_NOISE, abs_tol=0.0) else math.ceil(ticks)
+    return whole if math.isclose(ticks, whole, rel_tol=TICK_NOISE, abs_tol=0.0) else math.ceil(ticks)
 
 
 def to_seconds(ticks: int) -> float:

@@ -10,6 +10,7 @@ traceback, and exits with status 2. Anything else that escapes is a defect of si
     ├── SceneError           a mesh or scene that cannot be rendered
     ├── UsageError           options that contradict each other, the machine or the file system
     ├── UnreachableError     a transfer between two nodes that no route connects
+    ├── LinkFailedError      a transfer over a link that is down
     ├── ScheduleError        a policy used a device in a way it does not allow
     └── InvariantError       a policy lost or repeated a ray: a defect of that policy
 """
@@ -62,6 +63,10 @@ class UsageError(SimrenderError):
 
 class UnreachableError(SimrenderError):
     """A transfer was asked for between two nodes that no route connects."""
+
+
+class LinkFailedError(SimrenderError):
+    """A transfer was under way over a link, or reached one, that is down."""
 
 
 class ScheduleError(SimrenderError):

@@ -1,4 +1,5 @@
 import importlib.metadata
+import re
 import sys
 
 import pytest
@@ -259,6 +260,28 @@ def test_a_broken_plug_in_hides_nothing_else_from_the_list(plug_in, run_cli):
     assert "machines of 'somebodys_missing' are left out" in notes[0]
     assert "bad_node/card.yaml:2:1: not valid YAML" in notes[1]
     assert "the policy 'broken' (somebodys_wreck:Policy) cannot be loaded" in notes[2]
+
+
+def test_the_variants_of_a_card_are_listed_below_it(plug_in, run_cli):
+    plug_in("simrender.machines", "theirs", "somebodys_nodes", {
+        "somebodys_nodes/__init__.py": "",
+        "somebodys_nodes/new_node/card.yaml": "extends: dgx2\nvariants: {slow: {title: Slow}, odd: {gpus: 1}}\n",
+        "somebodys_nodes/bad_node/card.yaml": "title: Bad\nvariants: {slow: 3}\n",
+        "somebodys_nodes/lost_node/card.yaml": "extends: dgx3\n",
+    })  # fmt: skip
+    ran = run_cli("list", "machines")
+    assert ran.code == 0
+    title = "NVIDIA DGX-2 (16 V100 32 GB, NVSwitch), as changed by new-node"
+    lines = [re.split(" {2,}", line.rstrip(), maxsplit=1) for line in ran.out.splitlines()]
+    assert lines[lines.index(["new-node", title]) + 1 :][:2] == [
+        ["new-node:slow", "Slow"], ["new-node:odd", f"{title}, variant odd"],
+    ]  # fmt: skip
+    assert ["bad-node", "broken"] in lines
+    assert ["lost-node", "broken"] in lines
+    notes = ran.err.splitlines()
+    expected = "expected a mapping of the fields that differ, got 3"
+    assert notes[0].endswith(f"bad_node/card.yaml:2:18: variants.slow: {expected}")
+    assert "lost_node/card.yaml:1:10: extends: unknown machine 'dgx3'; did you mean 'dgx2'? (known: " in notes[1]
 
 
 # Generators

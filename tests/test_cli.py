@@ -230,10 +230,11 @@ def test_show_a_machine_with_the_source_of_every_value(run_cli):
     ran = run_cli("show", "dgx2")
     assert (ran.code, ran.err) == (0, "")
     assert ran.out.startswith("NVIDIA DGX-2 (16 V100 32 GB, NVSwitch)\n")
-    assert re.search(r"^gpus +16$", ran.out, re.M)
-    assert re.search(r"^gpu\.ray_tracing_cores +false$", ran.out, re.M)
-    assert re.search(r"^gpu\.rate_primitives +1e9  assumed$", ran.out, re.M)
-    assert re.search(r"^gpu\.memory_bandwidth +802 GB/s \(778 GB/s to 895 GB/s\)  measured$", ran.out, re.M)
+    assert re.search(r"^gpus +16 *$", ran.out, re.M)
+    assert re.search(r"^gpu *\n  model +Tesla V100", ran.out, re.M)
+    assert re.search(r"^  ray_tracing_cores +false *$", ran.out, re.M)
+    assert re.search(r"^  rate_primitives +1e9 +assumed +the size of scene", ran.out, re.M)
+    assert re.search(r"^  memory_bandwidth +802 GB/s \(778 to 895 GB/s\) +measured +gpu-stream copy", ran.out, re.M)
     assert "RQC table 1: 16 x 32 GB" in ran.out
 
 
@@ -241,13 +242,93 @@ def test_show_a_card_by_its_path(run_cli, tiny_card):
     ran = run_cli("show", tiny_card)
     assert ran.code == 0
     assert ran.out.startswith("A bumpy square\n")
-    assert re.search(r"^published\.resolution +64x36$", ran.out, re.M)
+    assert re.search(r"^published *\n  resolution +64x36 *$", ran.out, re.M)
+    assert re.search(r"^  position +\[2\.0, -2\.0, 1\.5\] *$", ran.out, re.M)
 
 
-@pytest.mark.parametrize("text", ["{}", "title: A [/b] c\ngpu: {value: 1, range: 5, source: 3, status: 2}\n"])
-def test_show_an_odd_card(run_cli, tiny_card, text):
+@pytest.mark.parametrize("columns", [80, 100, 160])
+def test_a_card_fits_the_width_it_is_given(run_cli, monkeypatch, columns):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    out = run_cli("show", "dgx2").out
+    lines = out.splitlines()
+    assert max(len(line) for line in lines) <= columns
+    start = next(line for line in lines if line.startswith("field")).index("source")
+    below = [line for line in lines[lines.index("") + 1 :] if line.strip()]
+    assert all(line[start - 2 : start] == "  " for line in below if len(line) > start), "a column runs into the next"
+    words = " ".join(" ".join(line[start:].strip() for line in below).split())
+    assert "SM copies reach 200 to 231 GB/s of 273 GB/s between two A100; the same share is taken here" in words
+    assert "\x1b" not in out
+
+
+@pytest.mark.parametrize(
+    ("text", "mistake"),
+    [
+        ("{}", "1:1: expected the card of a machine or a workload, got neither's fields"),
+        ("title: A [/b] c\nscene: 3\n", "2:8: scene: expected a section with the fields file, generator, arguments, "),
+        ("gpu: {value: 1, range: 5, source: 3, status: 2}\n", "1:7: gpu.value: unknown field"),
+    ],
+)
+def test_show_a_card_with_mistakes(run_cli, tiny_card, text, mistake):
     tiny_card.write_text(text)
-    assert run_cli("show", tiny_card).code == 0
+    ran = run_cli("show", tiny_card)
+    assert (ran.code, ran.out) == (2, "")
+    assert f"{tiny_card}:{mistake}" in ran.err
+
+
+def test_show_an_odd_policy_of_a_card(run_cli, tiny_card):
+    tiny_card.write_text(
+        f"{tiny_card.read_text()}policy: {{name: 'A [/b] c', odd: {{value: 1, range: 5, status: 2}}}}\n"
+    )
+    ran = run_cli("show", tiny_card)
+    assert ran.code == 0
+    assert "A [/b] c" in ran.out
+
+
+FAST_CARD = """\
+extends: dgx2
+nvlink: {bandwidth: 300 GB/s}
+variants:
+  small: {title: Four of them, gpus: 4}
+  late: {nvlink: {latency: 1 ms}}
+"""
+
+
+def test_show_says_which_values_another_card_says(run_cli, tmp_path):
+    path = tmp_path / "fast.yaml"
+    path.write_text(FAST_CARD)
+    out = run_cli("show", path).out
+    title = "NVIDIA DGX-2 (16 V100 32 GB, NVSwitch), as changed by fast"
+    assert out.startswith(f"{title}\nfast, {path}\n\nvariants\n")
+    assert re.search(r"^  fast:small  Four of them *$", out, re.M)
+    assert re.search(rf"^  fast:late   {re.escape(title)}, variant late *$", out, re.M)
+    assert re.search(r"^gpus +16 +from dgx2 *$", out, re.M)
+    assert re.search(r"^  bandwidth +300 GB/s *$", out, re.M)
+    assert re.search(r"^  latency +2\.5 us \(2\.26 to 2\.76 us\) +measured, from dgx2 +p2pBandwidth", out, re.M)
+
+
+def test_show_a_variant(run_cli, tmp_path):
+    path = tmp_path / "fast.yaml"
+    path.write_text(FAST_CARD)
+    out = run_cli("show", f"{path}:late").out
+    assert f"\nfast:late, {path}\n" in out
+    assert "variants" not in out
+    assert re.search(r"^  bandwidth +300 GB/s +from fast *$", out, re.M)
+    assert re.search(r"^  latency +1 ms *$", out, re.M)
+    ran = run_cli("show", "dgx2:late")
+    assert (ran.code, ran.err) == (2, "simrender: unknown variant of dgx2 'late' (known: none)\n")
+
+
+def test_a_variant_runs_wherever_a_name_does(run_cli, tmp_path, tiny_card):
+    path = tmp_path / "fast.yaml"
+    path.write_text(FAST_CARD)
+    tiny_card.write_text(f"{tiny_card.read_text()}variants: {{one: {{published: {{samples: 1}}}}}}\n")
+    result = results(run_cli("run", f"{path}:small", f"{tiny_card}:one", "--json", "-"))
+    assert (result["machine"], result["workload"], result["gpus"]) == (f"{path}:small", "tiny:one", 4)
+    assert result["counts"]["traced_camera_rays"] == 64 * 36
+    ran = run_cli("run", f"{path}:smal", tiny_card)
+    assert (ran.code, ran.err) == (
+        2, "simrender: unknown variant of fast 'smal'; did you mean 'small'? (known: late, small)\n",
+    )  # fmt: skip
 
 
 def test_show_a_policy_with_its_parameters(run_cli):

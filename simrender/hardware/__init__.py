@@ -1,5 +1,1 @@
-"""Simulated time, no rays: SimPy models of networks, processors and machines."""
-
-from simrender.hardware.network import Link, Network
-
-__all__ = ["Link", "Network"]
+"""Simulated time, no rays: SimPy models of networks, processors, storage, displays and machines."""

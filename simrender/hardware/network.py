@@ -8,25 +8,34 @@ TOMACS 23(4), 2013), without its corrections for TCP.
 
 from __future__ import annotations
 
-import heapq
 import math
 import operator
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
+import numpy as np
 import simpy
+from numpy.typing import ArrayLike, NDArray
 from simpy.events import NORMAL, EventPriority
 
-from simrender.clock import TICKS_PER_SECOND, to_ticks
-from simrender.errors import ScheduleError, UnreachableError, UsageError, did_you_mean
+from simrender.clock import TICKS_PER_SECOND, to_seconds, to_ticks
+from simrender.errors import LinkFailedError, ScheduleError, UnreachableError, UsageError, did_you_mean
+from simrender.hardware import fluid
+from simrender.hardware.routing import FewestHops
+from simrender.hardware.tables import FAR, FLOW, HEAP_SIZE, LOGGED, NONE, RATED, STORY, VACATED, WEIGHT_UNIT, Tables
 
 if TYPE_CHECKING:
     import networkx
 
-_Callback = Callable[[simpy.Event], None]
+Listener = Callable[[NDArray[np.int64], int], None]
+Routes = Mapping[tuple[Hashable, Hashable], Sequence[Hashable]] | Callable[[Any, Any], Sequence[Hashable] | None]
 
+_FIRST = EventPriority(NORMAL - 1)
 _LAST = EventPriority(NORMAL + 1)  # after everything that SimPy itself schedules at the same tick
+_HORIZON = FAR // 2
+_MOST_ROUTES = 2**17
+_WEIGHTS = (1.0 / 1024.0, 1024.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,105 +66,47 @@ class Link:
             raise ScheduleError(f"a link's latency must be finite and not negative, got {self.latency!r} s")
 
 
-def max_min_rates(capacities: Sequence[float], flow_links: Sequence[Sequence[int]]) -> list[float]:
-    """Share links between flows so that no flow could be faster without slowing one that is no faster than itself.
+@dataclass(frozen=True, slots=True)
+class LinkUse:
+    """What a link has done so far.
 
-    Progressive filling (Bertsekas and Gallager, *Data Networks*, 2nd ed., section 6.5.2): all rates grow together
-    until some links are full; the flows through those are frozen, and the others grow on. Links that fill at the same
-    rate fill in the same round, and a round takes the frozen flows from a link all at once. So the rates do not depend
-    on the order of flows or links, not even in their last bit.
-
-    Parameters
+    Attributes
     ----------
-    capacities : sequence of float
-        Bandwidth of each link in B/s, above zero. Links that no flow uses cost nothing.
-    flow_links : sequence of sequences of int
-        For each flow the indices of the links on its route, none of them twice.
-
-    Returns
-    -------
-    list of float
-        The rate of each flow in B/s; infinite for a flow that uses no link.
-
-    Examples
-    --------
-    Three flows, two links in a row: one flow takes both, each of the others takes one. The first link is the tighter
-    one and gives each of its flows 2; that leaves 8 on the second for the flow that uses it alone.
-
-    >>> max_min_rates([4.0, 10.0], [(0, 1), (0,), (1,)])
-    [2.0, 2.0, 8.0]
+    carried_bytes : float
+        Of the transfers that have arrived.
+    busy_s : float
+        How long at least one flow was on it.
+    mean_utilization, peak_utilization : float
+        Share of its bandwidth in use, over all time so far and at the highest moment.
 
     """
-    users: dict[int, list[int]] = {}
-    for flow, links in enumerate(flow_links):
-        for link in links:
-            if link in users:
-                users[link].append(flow)
-            else:
-                users[link] = [flow]
-    unfrozen = {link: len(flows) for link, flows in users.items()}
-    shares = {link: capacities[link] / n for link, n in unfrozen.items()}
-    residual: dict[int, float] = {}
-    rates = [math.inf] * len(flow_links)
-    filling = sum(map(bool, flow_links))
-    while filling:
-        share = min(shares.values())
-        frozen: list[int] = []
-        for full in [link for link, s in shares.items() if s == share]:
-            for flow in users[full]:
-                if rates[flow] == math.inf:
-                    rates[flow] = share
-                    frozen.append(flow)
-        filling -= len(frozen)
-        if not filling:
-            break
-        taken: dict[int, int] = {}
-        for flow in frozen:
-            for link in flow_links[flow]:
-                taken[link] = taken.get(link, 0) + 1
-        for link, n in taken.items():
-            left = unfrozen[link] - n
-            if left:
-                unfrozen[link] = left
-                residual[link] = residual.get(link, capacities[link]) - n * share
-                shares[link] = residual[link] / left
-            else:
-                del shares[link]
-    return rates
+
+    carried_bytes: float
+    busy_s: float
+    mean_utilization: float
+    peak_utilization: float
 
 
 class _Route:
     """The links from one node to another, by index; their latency in ticks; the bandwidth of a flow alone on them."""
 
-    __slots__ = ("bandwidth", "carried", "latency", "links")
+    __slots__ = ("bandwidth", "latency", "links", "padded")
 
-    def __init__(self, links: tuple[int, ...], latency: int, bandwidth: float) -> None:
-        self.links = links
-        self.latency = latency
-        self.bandwidth = bandwidth
-        self.carried = 0.0
+    def __init__(self, links: NDArray[np.int32], latency: int, bandwidth: float) -> None:
+        self.links, self.latency, self.bandwidth = links, latency, bandwidth
+        self.padded: list[int] = []
 
-
-class _Flow:
-    """Bytes on their way: what was left of them when their rate last changed, and when they will have arrived."""
-
-    __slots__ = ("done", "finish", "links", "mark", "nbytes", "number", "rate", "remaining", "route", "since", "start")
-
-    def __init__(self, done: simpy.Event, route: _Route, nbytes: float, start: int, number: int) -> None:
-        self.done = done
-        self.route = route
-        self.links = route.links
-        self.nbytes = self.remaining = nbytes
-        self.start = start
-        self.number = number
-        self.rate = 0.0
-        self.since = self.finish = self.mark = -1
+    def pad(self, width: int) -> None:
+        """Make the row of a table of that width."""
+        self.padded = [*self.links.tolist(), *[0] * (width - len(self.links))]
 
 
 class _Alarm(simpy.Event):
     """A SimPy timeout with a priority."""
 
-    def __init__(self, env: simpy.Environment, tick: int, priority: EventPriority, ring: _Callback) -> None:
+    def __init__(
+        self, env: simpy.Environment, tick: int, priority: EventPriority, ring: Callable[[simpy.Event], None]
+    ) -> None:
         self.env = env
         self.callbacks = [ring]
         self._ok = True
@@ -175,8 +126,13 @@ class Network:
         Its time is an integer number of ticks (`simrender.clock`).
     links : mapping of name to Link
         Every link that a route may name.
-    routes : mapping of (source, target) to a sequence of link names
-        The way of a message; empty for a copy that stays where it is.
+    routes : mapping of (source, target) to a sequence of link names, or a function of source and target
+        The way of a message; empty for a copy that stays where it is. A function is asked when a pair is first used,
+        and returns None where there is no way.
+    nodes : iterable, optional
+        What the function connects, for messages; a mapping names its nodes itself.
+    record : bool
+        Whether to log the load of every link (`loads`).
 
     Attributes
     ----------
@@ -184,8 +140,6 @@ class Network:
         Bytes of all transfers asked for so far.
     flows_finished : int
         Transfers that have arrived.
-    reratings : int
-        How many times the rate of a flow was computed: what the network costs to simulate.
 
     Raises
     ------
@@ -198,29 +152,42 @@ class Network:
         self,
         env: simpy.Environment,
         links: Mapping[Hashable, Link],
-        routes: Mapping[tuple[Hashable, Hashable], Sequence[Hashable]],
+        routes: Routes,
+        *,
+        nodes: Iterable[Hashable] = (),
+        record: bool = False,
     ) -> None:
         self.sent_bytes = 0.0
         self.flows_finished = 0
-        self.reratings = 0
         self._env = env
-        self._links = dict(links)
-        self._index = {name: i for i, name in enumerate(self._links)}
-        self._capacities = [float(link.bandwidth) for link in self._links.values()]
-        for (source, target), names in routes.items():
-            self._check_route(source, target, names)
-        given = {pair: tuple(names) for pair, names in routes.items()}
-        self._nodes = list(dict.fromkeys(node for pair in given for node in pair))
-        self._find: Callable[[Hashable, Hashable], Sequence[Hashable] | None] = lambda s, t: given.get((s, t))
+        self._nominal = dict(links)
+        self._index = {name: i for i, name in enumerate(self._nominal)}
+        self._nodes = list(nodes)
+        if isinstance(routes, Mapping):
+            for (source, target), names in routes.items():
+                self._check_route(source, target, names)
+            given = {pair: tuple(names) for pair, names in routes.items()}
+            self._nodes = list(dict.fromkeys([*self._nodes, *(node for pair in given for node in pair)]))
+            self._find: Callable[[Any, Any], Sequence[Hashable] | None] = lambda s, t: given.get((s, t))
+        else:
+            self._find = routes
         self._routes: dict[tuple[Hashable, Hashable], _Route] = {}
+        self._disturbed: dict[int, list[float]] = {}
+        self._down: dict[int, Hashable] = {}
+
+        rows = 1024 + 2 * len(self._nominal) if record else 0
+        self._t = Tables.room(0, len(self._nominal), 4, rows)
+        self._t.links["capacity"] = [link.bandwidth for link in self._nominal.values()]
+        self._epochs: list[tuple[int, int]] = []  # rows of the log before which an epoch ended
+        self._owners: list[Any] = []
+        self._pairs: list[tuple[Any, Any]] = []
+        self._keys = np.zeros(0, np.int64)
+        self._free: list[int] = []
+
         self._started = 0
-        self._users: list[dict[int, _Flow]] = [{} for _ in self._links]
-        self._vacated: list[dict[int, _Flow]] = []
-        self._arrivals: dict[int, list[_Flow]] = {}
-        self._finishes: list[tuple[int, int, int, _Flow]] = []
+        self._epoch = 0
+        self._arrivals: dict[int, list[int]] = {}
         self._armed: float = math.inf
-        self._stamp = 0
-        self._link_marks = [0] * len(self._links)
 
     @classmethod
     def from_graph(cls, env: simpy.Environment, digraph: networkx.DiGraph[Any]) -> Network:
@@ -256,21 +223,85 @@ class Network:
                 links[u, v] = Link(data["bandwidth"], data.get("latency", 0.0))
             except ScheduleError as error:
                 raise ScheduleError(f"the edge {u!r} -> {v!r}: {error}") from None
-        network = cls(env, links, {})
-        network._nodes = list(digraph)
-        network._find = _FewestHops(network._nodes, links).route
-        return network
+        nodes = list(digraph)
+        find = FewestHops(nodes, {edge: to_ticks(link.latency) for edge, link in links.items()}).route
+        return cls(env, links, find, nodes=nodes)
+
+    # -- what it has done -----------------------------------------------------------------------------------------
+
+    @property
+    def reratings(self) -> int:
+        """How many times the rate of a flow was computed: what the network costs to simulate."""
+        return int(self._t.counters[RATED])
 
     @property
     def carried_bytes(self) -> dict[Hashable, float]:
         """Bytes that each link has carried, of the transfers that have arrived."""
-        shares: list[list[float]] = [[] for _ in self._links]
-        for route in self._routes.values():
-            for link in route.links:
-                shares[link].append(route.carried)
-        return {name: math.fsum(share) for name, share in zip(self._links, shares, strict=True)}
+        carried = self._t.links["carried"] + self._t.links["carried_low"]
+        return dict(zip(self._nominal, carried.tolist(), strict=True))
 
-    def transfer(self, source: Hashable, target: Hashable, nbytes: float, *, start: int | None = None) -> simpy.Event:
+    @property
+    def use(self) -> dict[Hashable, LinkUse]:
+        """Bytes, busy time, mean and peak utilization of each link, over all time so far."""
+        now = int(self._env.now)
+        table: dict[Hashable, LinkUse] = {}
+        rows = zip(self._nominal.items(), self._t.links, self.carried_bytes.values(), strict=True)
+        for (name, link), row, carried in rows:
+            busy = float(row["busy"]) + (now - self._epoch - int(row["busy_since"]) if row["users"] else 0)
+            mean = carried / (link.bandwidth * to_seconds(now)) if now else 0.0
+            table[name] = LinkUse(carried, busy / TICKS_PER_SECOND, mean, float(row["peak"]))
+        return table
+
+    @property
+    def loads(self) -> list[tuple[int, Hashable, float]]:
+        """Every change of a link's load: the tick, the link's name, and the sum of the rates through it in B/s."""
+        names = list(self._nominal)
+        count = int(self._t.counters[LOGGED])
+        rows = self._t.log[:count].tolist()
+        epoch = 0
+        ends = [*self._epochs, (count + 1, 0)]
+        table = []
+        for i, (tick, link, load) in enumerate(rows):
+            while i >= ends[0][0]:
+                epoch = ends.pop(0)[1]
+            table.append((epoch + tick, names[link], load))
+        return table
+
+    def latency_ticks(self, source: Hashable, target: Hashable) -> int:
+        """Return the latency of the route between two nodes.
+
+        Raises
+        ------
+        UnreachableError
+            If there is none.
+
+        """
+        return self._route(source, target).latency
+
+    def bandwidth(self, source: Hashable, target: Hashable) -> float:
+        """Return what a flow alone between two nodes gets, in B/s, while no link is slowed down.
+
+        Raises
+        ------
+        UnreachableError
+            If no route connects them.
+
+        """
+        return self._route(source, target).bandwidth
+
+    # -- sending --------------------------------------------------------------------------------------------------
+
+    def transfer(
+        self,
+        source: Hashable,
+        target: Hashable,
+        nbytes: float,
+        *,
+        start: int | None = None,
+        weight: float = 1.0,
+        cap: float = math.inf,
+        delay: int = 0,
+    ) -> simpy.Event:
         """Send bytes from one node to another.
 
         Parameters
@@ -281,40 +312,235 @@ class Network:
             How much to send; finite and not negative. No bytes take the latency alone.
         start : int, optional
             The tick at which the sender begins; now, unless given.
+        weight : float
+            Where flows share a full link, their rates are as their weights; between 1/1024 and 1024.
+        cap : float
+            The most that this flow gets, in B/s: a copy engine, a protocol.
+        delay : int
+            Ticks of latency beside the route's own.
 
         Returns
         -------
         simpy.Event
             Succeeds when the last byte has arrived; its value is that tick. Transfers that arrive at the same tick
-            succeed in the order in which they started.
+            succeed in the order in which they started. Fails with a `LinkFailedError` if a link of the route is down.
 
         Raises
         ------
         UnreachableError
             If no route connects the two.
         ScheduleError
-            If the size is negative, infinite or not a number, or the start lies in the past.
+            If a number is out of range, or the start lies in the past.
 
         """
-        route = self._routes.get((source, target)) or self._add_route(source, target)
+        route = self._routes.get((source, target)) or self._route(source, target)
         now = cast("int", self._env.now)
         if not 0.0 <= nbytes < math.inf:
             raise ScheduleError(f"a transfer's size must be finite and not negative, got {nbytes!r} B")
         start = now if start is None else operator.index(start)
         if start < now:
             raise ScheduleError(f"a transfer cannot start at tick {start}, before now, tick {now}")
-        flow = _Flow(simpy.Event(self._env), route, float(nbytes), start, self._started)
+        if not _WEIGHTS[0] <= weight <= _WEIGHTS[1]:
+            raise ScheduleError(f"a transfer's weight must lie between 1/1024 and 1024, got {weight!r}")
+        if not cap > 0.0:
+            raise ScheduleError(f"a transfer's cap must be above zero, got {cap!r} B/s")
+        if delay < 0:
+            raise ScheduleError(f"a transfer's delay must not be negative, got {delay!r} ticks")
+        if not self._free:
+            self._grow(1)
+        slot = self._free.pop()
+        done = self._owners[slot] = simpy.Event(self._env)
+        self._pairs[slot] = (source, target)
+        arrival = start + route.latency + delay
+        relative = min(arrival - self._epoch, FAR)
+        hops = len(route.links) if nbytes else 0
+        self._t.flows[slot] = (relative, 0, nbytes, 0.0, round(weight / WEIGHT_UNIT), hops, 0, 0, NONE, NONE, NONE)
+        self._t.story[slot] = (cap, nbytes, min(start - self._epoch, FAR), self._started)
+        self._t.hops[slot, : len(route.links)] = route.links
         self._started += 1
-        self.sent_bytes += flow.nbytes
-        if flow.nbytes and route.links:
-            self._settle_at(start + route.latency).append(flow)
+        self.sent_bytes += nbytes
+        if (nbytes and (hops or cap < math.inf)) or relative >= _HORIZON:
+            self._settle_at(arrival).append(slot)
         else:
-            flow.links = ()
-            self._finish_at(flow, start + route.latency)
+            fluid.add_alone(self._t, np.array([slot], np.int32))
             self._arm()
-        return flow.done
+        return done
 
-    def _settle_at(self, tick: int) -> list[_Flow]:
+    def post(
+        self,
+        sources: Sequence[Hashable],
+        targets: Sequence[Hashable],
+        nbytes: ArrayLike,
+        starts: ArrayLike,
+        listener: Listener,
+        keys: ArrayLike,
+        *,
+        caps: ArrayLike | None = None,
+        delays: ArrayLike | None = None,
+    ) -> None:
+        """Send many messages, without an event each.
+
+        Parameters
+        ----------
+        sources, targets : sequences of n hashables
+        nbytes : float64 array, (n,)
+        starts : int64 array, (n,)
+            The ticks at which the senders begin.
+        listener : callable
+            Called with ``(keys, tick)`` whenever some of them have arrived: their keys as an int64 array, in the order
+            in which they started.
+        keys : int64 array, (n,)
+            What the caller calls the messages.
+        caps : float64 array, (n,), optional
+            The most that each gets, in B/s.
+        delays : int64 array, (n,), optional
+            Ticks of latency beside the routes' own.
+
+        Raises
+        ------
+        UnreachableError, ScheduleError
+            As for `transfer`; then none of them is sent. If a link fails under one of them, the simulation ends with a
+            `LinkFailedError`.
+
+        """
+        sizes, begins = np.asarray(nbytes, np.float64), np.asarray(starts, np.int64)
+        count, now = len(sizes), cast("int", self._env.now)
+        if count == 0:
+            return
+        known = self._routes
+        routes = [known.get(pair) or self._route(*pair) for pair in zip(sources, targets, strict=True)]
+        if not (np.isfinite(sizes).all() and sizes.min() >= 0.0):
+            raise ScheduleError("a transfer's size must be finite and not negative")
+        if begins.min() < now:
+            raise ScheduleError(f"a transfer cannot start at tick {begins.min()}, before now, tick {now}")
+        ends = begins + np.fromiter((route.latency for route in routes), np.int64, count)
+        if delays is not None:
+            ends += np.asarray(delays, np.int64)
+        if len(self._free) < count:
+            self._grow(count)
+        slots = self._free[-count:][::-1]
+        del self._free[-count:]
+        at = np.array(slots, np.int32)
+        rows, stories = np.zeros(count, FLOW), np.zeros(count, STORY)
+        lengths = np.fromiter((len(route.links) for route in routes), np.int64, count)
+        stories["start"] = begins - self._epoch
+        stories["number"] = np.arange(self._started, self._started + count)
+        stories["nbytes"] = rows["remaining"] = sizes
+        rows["finish"] = ends - self._epoch
+        rows["weight"] = round(1.0 / WEIGHT_UNIT)
+        stories["cap"] = math.inf if caps is None else caps
+        rows["hops"] = np.where(sizes > 0.0, lengths, 0)
+        rows["next"] = rows["leader"] = rows["place"] = NONE
+        self._t.flows[at], self._t.story[at] = rows, stories
+        columns = np.arange(int(lengths.max(initial=0)))
+        self._t.hops[at[:, None], columns] = [route.padded[: len(columns)] for route in routes]
+        self._keys[at] = np.asarray(keys, np.int64)
+        for slot, pair in zip(slots, zip(sources, targets, strict=True), strict=True):
+            self._owners[slot] = listener
+            self._pairs[slot] = pair
+        self._started += count
+        self.sent_bytes += float(sizes.sum())
+        joins = (sizes > 0.0) & ((lengths > 0) | np.isfinite(stories["cap"])) | (rows["finish"] >= _HORIZON)
+        if not joins.all():
+            fluid.add_alone(self._t, at[~joins])
+        if joins.any():
+            ticks, which = np.unique(ends[joins], return_inverse=True)
+            order = np.argsort(which, kind="stable")
+            for tick, group in zip(
+                ticks.tolist(), np.split(at[joins][order], np.cumsum(np.bincount(which))[:-1]), strict=True
+            ):
+                self._settle_at(tick).extend(group.tolist())
+        self._arm()
+
+    # -- links that slow down or fail -----------------------------------------------------------------------------
+
+    def disturb(self, link: Hashable, share: float, start: int, end: int | None = None) -> None:
+        """Slow a link down to a share of its bandwidth from one tick until another; to nothing, which is a failure.
+
+        While a link is down, the transfers over it fail, both those under way and those that reach it. Of several
+        disturbances of one link the worst counts.
+
+        Parameters
+        ----------
+        link : hashable
+            A link's name.
+        share : float
+            From 0, a failure, to 1.
+        start, end : int
+            Ticks; without an end it stays so.
+
+        Raises
+        ------
+        UsageError
+            If there is no such link.
+        ScheduleError
+            If a number is out of range.
+
+        """
+        if link not in self._index:
+            raise UsageError(f"there is no link {link!r}{_near(link, self._index)}")
+        now = cast("int", self._env.now)
+        if not 0.0 <= share <= 1.0:
+            raise ScheduleError(f"a link's share of its bandwidth must lie between 0 and 1, got {share!r}")
+        if not now <= start < (math.inf if end is None else end):
+            raise ScheduleError(f"a disturbance of {link!r} must begin now or later and end after it has begun")
+        index = self._index[link]
+        shares = self._disturbed.setdefault(index, [])
+
+        def begin(_: simpy.Event) -> None:
+            shares.append(share)
+            self._recapacitate(index)
+
+        def finish(_: simpy.Event) -> None:
+            shares.remove(share)
+            self._recapacitate(index)
+
+        _Alarm(self._env, start, _FIRST, begin)
+        if end is not None:
+            _Alarm(self._env, end, _FIRST, finish)
+
+    def _recapacitate(self, link: int) -> None:
+        """Give a link the bandwidth it now has; have its flows rated anew, or fail."""
+        name, nominal = list(self._nominal.items())[link]
+        share = min(self._disturbed[link], default=1.0)
+        users, entry = [], int(self._t.links[link]["first"])
+        while entry != NONE:
+            users.append(entry // self._t.hops.shape[1])
+            entry = int(self._t.after[entry])
+        slots = np.array(sorted(users, key=lambda slot: int(self._t.story[slot]["number"])), np.int32)
+        if share > 0.0:
+            self._down.pop(link, None)
+            self._t.links[link]["capacity"] = share * nominal.bandwidth
+            fluid.upset(self._t, slots)
+        else:
+            self._down[link] = name
+            fluid.evict(self._t, slots, self._now())
+            for slot in slots.tolist():
+                self._fail(slot)
+        self._settle_at(cast("int", self._env.now))
+
+    def _fail(self, slot: int) -> None:
+        source, target = self._pairs[slot]
+        links = self._route(source, target).links.tolist()
+        name = next(self._down[link] for link in links if link in self._down)
+        now = cast("int", self._env.now)
+        error = LinkFailedError(
+            f"the link {name} is down at {to_seconds(now):.9g} s, with {self._t.story[slot]['nbytes']:.0f} B "
+            f"from {source!r} to {target!r} on their way"
+        )
+        owner = self._owners[slot]
+        self._owners[slot] = None
+        self._free.append(slot)
+        if not isinstance(owner, simpy.Event):
+            raise error
+        owner.fail(error)
+
+    def _meets_failure(self, slot: int) -> bool:
+        return any(link in self._down for link in self._route(*self._pairs[slot]).links.tolist())
+
+    # -- the course of events -------------------------------------------------------------------------------------
+
+    def _settle_at(self, tick: int) -> list[int]:
         """Return the flows that join at a tick, having made sure that there will be a re-rating at its very end."""
         flows = self._arrivals.get(tick)
         if flows is None:
@@ -324,96 +550,126 @@ class Network:
 
     def _settle(self, _: simpy.Event) -> None:
         """Re-rate each component of flows in which something has started or ended at this tick."""
-        now = cast("int", self._env.now)
-        arrivals = self._arrivals.pop(now)
-        for flow in arrivals:
-            for link in flow.links:
-                self._users[link][flow.number] = flow
-        # A link that was left has one component of flows still on it, which any of them leads to.
-        touched = arrivals + [next(iter(users.values())) for users in self._vacated if users]
-        self._vacated.clear()
-        self._stamp += 1
-        for flow in touched:
-            if flow.mark != self._stamp:
-                self._rate(self._component(flow), now)
+        arrivals = self._arrivals.pop(cast("int", self._env.now))
+        if self._down:
+            for slot in [slot for slot in arrivals if self._meets_failure(slot)]:
+                arrivals.remove(slot)
+                self._fail(slot)
+        self._rate(arrivals, self._now())
         self._arm()
 
-    def _component(self, flow: _Flow) -> list[_Flow]:
-        """Mark and return the flows that share a link with this one, or with one that does, and so on."""
-        stamp, marks = self._stamp, self._link_marks
-        flow.mark = stamp
-        component = [flow]
-        for member in component:  # grows as it goes
-            for link in member.links:
-                if marks[link] != stamp:
-                    marks[link] = stamp
-                    users = self._users[link]
-                    if len(users) > 1:
-                        for other in users.values():
-                            if other.mark != stamp:
-                                other.mark = stamp
-                                component.append(other)
-        return component
-
-    def _rate(self, component: list[_Flow], now: int) -> None:
-        """Give the flows of a component their fair rates, and those whose rate changes a new tick to finish at."""
-        self.reratings += len(component)
-        if len(component) == 1:
-            rates = [component[0].route.bandwidth]
-        else:
-            rates = max_min_rates(self._capacities, [flow.links for flow in component])
-        for flow, rate in zip(component, rates, strict=True):
-            if rate != flow.rate:
-                flow.remaining = max(0.0, flow.remaining - flow.rate * ((now - flow.since) / TICKS_PER_SECOND))
-                flow.since = now
-                flow.rate = rate
-                self._finish_at(flow, now + to_ticks(flow.remaining / rate))
-
-    def _finish_at(self, flow: _Flow, tick: int) -> None:
-        """Queue a flow to arrive at a tick; whatever it was queued for before is void."""
-        flow.finish = tick
-        heapq.heappush(self._finishes, (tick, flow.start, flow.number, flow))
+    def _rate(self, arrivals: list[int], now: int) -> None:
+        if len(self._t.log) and self._t.counters[LOGGED] + 2 * len(self._t.links) > len(self._t.log):
+            fluid.forget(self._t)
+            self._t = self._t.grown(len(self._t.flows), self._t.hops.shape[1], 2 * len(self._t.log))
+        fluid.settle(self._t, np.array(arrivals, np.int32), now)
 
     def _arm(self) -> None:
         """Make sure that the network wakes up when the next flow arrives."""
-        queue = self._finishes
-        if len(queue) > 64 + 4 * (self._started - self.flows_finished):
-            # A long flow leaves a void entry in the far future whenever a neighbour comes and goes.
-            queue[:] = [entry for entry in queue if entry[3].finish == entry[0]]
-            heapq.heapify(queue)
-        while queue and queue[0][3].finish != queue[0][0]:
-            heapq.heappop(queue)
-        if queue and queue[0][0] < self._armed:
-            self._armed = queue[0][0]
-            _Alarm(self._env, queue[0][0], NORMAL, self._wake)
+        if self._t.counters[HEAP_SIZE] == 0:
+            return
+        key = int(self._t.heap[0]["tick"])
+        tick = self._epoch + key if key < FAR else min(self._far_ticks().values())
+        if tick < self._armed:
+            self._armed = tick
+            _Alarm(self._env, tick, NORMAL, self._wake)
 
     def _wake(self, _: simpy.Event) -> None:
         """Let go of the flows that arrive at this tick."""
-        now = cast("int", self._env.now)
-        if now != self._armed:
+        tick = cast("int", self._env.now)
+        if tick != self._armed:
             return  # an earlier one was armed since, and has done the work of both
         self._armed = math.inf
-        queue = self._finishes
-        while queue and queue[0][0] <= now:
-            entry = heapq.heappop(queue)
-            if entry[3].finish == entry[0]:
-                self._release(entry[3], now)
-        if any(self._vacated):
-            self._settle_at(now)
-        else:
-            self._vacated.clear()
+        now = self._now()
+        count = fluid.release(self._t, now)
+        slots = self._t.arrived[:count]
+        if count > 1:
+            told = self._t.story[slots]
+            slots = slots[np.lexsort((told["number"], told["start"]))]
+        if vacated := int(self._t.counters[VACATED]):
+            if self._t.links["users"][self._t.vacated[:vacated]].any():
+                self._settle_at(tick)
+            else:
+                self._rate([], now)
+        batches: dict[Listener, list[int]] = {}
+        for slot in slots.tolist():
+            owner = self._owners[slot]
+            if self._down and self._meets_failure(slot):  # a message without bytes
+                self._fail(slot)
+                continue
+            self._owners[slot] = None
+            self.flows_finished += 1
+            if isinstance(owner, simpy.Event):
+                owner.succeed(tick)
+            else:
+                batches.setdefault(owner, []).append(slot)
+            self._free.append(slot)
+        for listener, theirs in batches.items():
+            listener(self._keys[theirs], tick)
         self._arm()
 
-    def _release(self, flow: _Flow, now: int) -> None:
-        flow.finish = -1
-        flow.route.carried += flow.nbytes
-        self.flows_finished += 1
-        for link in flow.links:
-            users = self._users[link]
-            del users[flow.number]
-            if users:
-                self._vacated.append(users)
-        flow.done.succeed(now)
+    # -- ticks beyond the horizon of the kernels ------------------------------------------------------------------
+
+    def _now(self) -> int:
+        """Return the tick it is, relative to the epoch, which moves when that would become too large."""
+        now = cast("int", self._env.now) - self._epoch
+        if now < _HORIZON:
+            return now
+        fluid.forget(self._t)
+        far = self._far_ticks()
+        used = np.array([slot for slot, owner in enumerate(self._owners) if owner is not None], np.int64)
+        flows, starts = self._t.flows[used], self._t.story["start"][used].tolist()
+        elapsed = np.array([(now - since) / TICKS_PER_SECOND for since in flows["since"].tolist()])
+        self._t.flows["remaining"][used] = np.maximum(0.0, flows["remaining"] - flows["rate"] * elapsed)
+        self._t.flows["since"][used] = 0
+        self._t.story["start"][used] = [max(-FAR, start - now) for start in starts]
+        left = [
+            far[slot] - self._epoch - now if slot in far else tick - now
+            for slot, tick in zip(used.tolist(), flows["finish"].tolist(), strict=True)
+        ]
+        self._t.flows["finish"][used] = [tick if tick < _HORIZON else FAR for tick in left]
+        for i in range(int(self._t.counters[HEAP_SIZE])):
+            member, tick = int(self._t.heap[i]["leader"]), FAR
+            while member != NONE:
+                tick = min(tick, int(self._t.flows[member]["finish"]))
+                member = int(self._t.flows[member]["next"])
+            self._t.heap[i]["tick"] = tick
+        fluid.reheap(self._t)
+        since = self._t.links["busy_since"]
+        self._t.links["busy"] += np.where(self._t.links["users"] > 0, float(now) - since, 0.0)
+        self._t.links["busy_since"] = 0
+        self._epochs.append((int(self._t.counters[LOGGED]), self._epoch + now))
+        self._epoch += now
+        return 0
+
+    def _far_ticks(self) -> dict[int, int]:
+        """Return the slots of flows that arrive beyond the horizon, with their ticks."""
+        slots = [s for s in np.flatnonzero(self._t.flows["finish"] == FAR).tolist() if self._owners[s] is not None]
+        return {
+            slot: self._epoch + int(flow["since"]) + to_ticks(float(flow["remaining"] / flow["rate"]))
+            for slot, flow in zip(slots, self._t.flows[slots], strict=True)
+            if flow["rate"] > 0.0
+        }
+
+    # -- routes and room ------------------------------------------------------------------------------------------
+
+    def _grow(self, wanted: int) -> None:
+        """Make room for more flows."""
+        old = len(self._t.flows)
+        size = max(64, 2 * old, old + wanted)
+        fluid.forget(self._t)
+        self._t = self._t.grown(size, self._t.hops.shape[1], len(self._t.log))
+        self._keys = np.concatenate([self._keys, np.zeros(size - old, np.int64)])
+        self._owners += [None] * (size - old)
+        self._pairs += [(None, None)] * (size - old)
+        self._free += range(size - 1, old - 1, -1)
+
+    def _widen(self, hops: int) -> None:
+        """Make room for longer routes."""
+        fluid.forget(self._t)
+        self._t = self._t.grown(len(self._t.flows), 2 * hops, len(self._t.log))
+        for route in self._routes.values():
+            route.pad(2 * hops)
 
     def _check_route(self, source: Hashable, target: Hashable, names: Sequence[Hashable]) -> None:
         for i, name in enumerate(names):
@@ -423,14 +679,29 @@ class Network:
             if name in names[:i]:
                 raise UsageError(f"the route {source!r} -> {target!r} uses the link {name!r} twice")
 
-    def _add_route(self, source: Hashable, target: Hashable) -> _Route:
-        names = self._find(source, target)
-        if names is None:
-            raise UnreachableError(f"no route {source!r} -> {target!r}{self._alternatives(source, target)}")
-        links = tuple(self._index[name] for name in names)
-        latency = to_ticks(math.fsum(self._links[name].latency for name in names))
-        bandwidth = min((self._capacities[link] for link in links), default=math.inf)
-        route = self._routes[source, target] = _Route(links, latency, bandwidth)
+    def _route(self, source: Hashable, target: Hashable) -> _Route:
+        """Return the route between two nodes, made when first asked for."""
+        route = self._routes.get((source, target))
+        if route is None:
+            names = self._find(source, target)
+            if names is None:
+                raise UnreachableError(f"no route {source!r} -> {target!r}{self._alternatives(source, target)}")
+            try:
+                links = np.array([self._index[name] for name in names], np.int32)
+            except KeyError:
+                self._check_route(source, target, names)
+                raise
+            if len(set(names)) < len(names):
+                self._check_route(source, target, names)
+            used = [self._nominal[name] for name in names]
+            latency = to_ticks(math.fsum(link.latency for link in used))
+            if len(links) > self._t.hops.shape[1]:
+                self._widen(len(links))
+            if len(self._routes) >= _MOST_ROUTES:  # each pair of a thousand ranks, once each
+                self._routes.clear()
+            route = _Route(links, latency, min((link.bandwidth for link in used), default=math.inf))
+            route.pad(self._t.hops.shape[1])
+            self._routes[source, target] = route
         return route
 
     def _alternatives(self, source: Hashable, target: Hashable) -> str:
@@ -441,48 +712,6 @@ class Network:
         if not others:
             return f"; {source!r} reaches no other node"
         return f"; {source!r} reaches {', '.join(others[:8])}{', ...' if len(others) > 8 else ''}"
-
-
-class _FewestHops:
-    """Routes of the fewest hops over named edges, one breadth-first tree a source, made when first asked for."""
-
-    def __init__(self, nodes: Iterable[Hashable], links: Mapping[Any, Link]) -> None:
-        self._next: dict[Hashable, list[tuple[Hashable, int]]] = {node: [] for node in nodes}
-        for (u, v), link in links.items():
-            self._next[u].append((v, to_ticks(link.latency)))
-        self._trees: dict[Hashable, dict[Hashable, Hashable]] = {}
-
-    def route(self, source: Hashable, target: Hashable) -> tuple[Hashable, ...] | None:
-        """Return the edges from source to target, or None where there is no way."""
-        if source not in self._next:
-            return None
-        if source not in self._trees:
-            self._trees[source] = self._tree(source)
-        tree = self._trees[source]
-        if target not in tree:
-            return None
-        edges: list[Hashable] = []
-        while target != source:
-            edges.append((tree[target], target))
-            target = tree[target]
-        return tuple(reversed(edges))
-
-    def _tree(self, source: Hashable) -> dict[Hashable, Hashable]:
-        """Return each reachable node's predecessor on its route from the source."""
-        before = {source: source}
-        # Latencies add up in ticks, where sums are exact, so that equally long routes do tie.
-        level: dict[Hashable, tuple[int, tuple[str, ...]]] = {source: (0, (repr(source),))}
-        while level:
-            reached: dict[Hashable, tuple[int, tuple[str, ...]]] = {}
-            for node, (latency, names) in level.items():
-                for other, hop in self._next[node]:
-                    if other not in before or other in reached:
-                        cost = (latency + hop, (*names, repr(other)))
-                        if other not in reached or cost < reached[other]:
-                            reached[other] = cost
-                            before[other] = node
-            level = reached
-        return before
 
 
 def _near(name: Hashable, known: Iterable[Hashable]) -> str:
