@@ -178,6 +178,7 @@ def run(
     *,
     policy: str | None = None,
     islands: str = "auto",
+    nodes: Whole | None = None,
     gpus: Whole | None = None,
     set_: Set = (),
     seed: Whole = 1,
@@ -198,8 +199,10 @@ def run(
         The scheduler; by default the workload's own.
     islands
         How many islands, or auto: as many as the fewest GPUs that hold the model allow.
+    nodes
+        Use only so many of the machine's nodes.
     gpus
-        Use only so many of the machine's GPUs.
+        Use only so many GPUs of those.
     set_
         Change a value of a card: PATH=VALUE, where PATH starts with machine. or workload. or policy.
     seed
@@ -231,7 +234,7 @@ def run(
     begin = time.perf_counter()
     with _Progress() as progress:
         result = simulate(
-            machine, workload, policy, islands=count, gpus=gpus, seed=seed,
+            machine, workload, policy, islands=count, nodes=nodes, gpus=gpus, seed=seed,
             overrides=split_assignments(set_, ("machine", "workload", "policy")), cache=cache, progress=progress,
         )  # fmt: skip
     seconds = time.perf_counter() - begin

@@ -38,6 +38,8 @@ class Result:
     ----------
     machine, workload, policy : str
     seed : int
+    processor : str
+        What renders: ``GPU``, or ``node`` on a machine without GPUs, whose nodes then count as GPUs below.
     gpus, islands, island_size, unused_gpus : int
         GPUs that were offered; islands and GPUs of each; GPUs that were left over.
     feasible : bool
@@ -66,6 +68,7 @@ class Result:
     workload: str
     policy: str
     seed: int
+    processor: str
     gpus: int
     islands: int
     island_size: int
@@ -188,12 +191,32 @@ def owned_up(quantities: list[tuple[str, Quantity]]) -> list[dict[str, str]]:
 
 def scope(machine: Machine, island_size: int) -> dict[str, Any]:
     """Return what was modelled, and what was left out, with the reasons."""
-    modelled = [f"{len(machine.processors)} GPUs, one stream each: kernel launch, saturation, memory"]
-    modelled.append("the host thread that issues kernels and copies one after the other")
+    card, count = machine.card, len(machine.processors)
+    if card.gpus:
+        modelled = [f"{count} GPUs, one stream each: kernel launch, saturation, memory"]
+        hosts = "thread" if machine.nodes == 1 else "thread of each node"
+        modelled.append(f"the host {hosts} that issues kernels and copies one after the other")
+    else:
+        modelled = [f"{count} nodes, all cores of each as one processor: saturation, memory"]
     left_out = [{"what": what, "why": why} for what, why in LEFT_OUT]
+    fabrics = [name for name in ("nvlink", "pcie") if card.gpus > 1 and getattr(card, name)]
     if machine.has_network:
         users = "ray queues and finished pixels" if island_size > 1 else "finished pixels"
-        modelled.append(f"{machine.card.fabric_name} between the GPUs, shared max-min fairly by the copies of {users}")
+        if machine.nodes > 1 and card.network:
+            fabrics.append(card.network.technology)
+        what = "GPUs" if card.gpus else "nodes"
+        modelled.append(f"{' and '.join(fabrics)} between the {what}, shared max-min fairly by the copies of {users}")
+        if machine.nodes > 1:
+            modelled.append("the hosts' allgather of queue counters")
+            why = "a rank goes on when its messages have arrived; the queue counters pay for the rest"
+            left_out.append({"what": "barriers between nodes", "why": why})
+            if card.gpus and card.network and not card.network.gpu_direct:
+                modelled.append("staging through the memory of both hosts, which costs two more links")
     else:
-        left_out.append({"what": machine.card.fabric_name, "why": "one GPU sends nothing"})
+        unused = " and ".join(fabrics) or "the way between processors"
+        left_out.append({"what": unused, "why": "one GPU sends nothing" if card.gpus else "one node sends nothing"})
+    if card.variability:
+        modelled.append(f"nodes that differ in speed by {card.variability.spread.text}")
+    if card.disturbances:
+        modelled.append(f"{len(card.disturbances)} disturbances of links")
     return {"modelled": modelled, "left_out": left_out}

@@ -15,7 +15,7 @@ from simrender.cards import Document
 from simrender.catalog import find_policy, policies
 from simrender.clock import to_seconds
 from simrender.errors import InvariantError, UsageError, did_you_mean
-from simrender.hardware.machine import Machine, MachineCard, check_gpus, load_machine
+from simrender.hardware.machine import Machine, MachineCard, check_processors, load_machine
 from simrender.policies.frame import Frame, Policy
 from simrender.policies.islands import Fit, Layout, fit
 from simrender.policies.rank import PIXEL_BYTES, Rank
@@ -34,6 +34,7 @@ def simulate(
     policy: str | Policy | None = None,
     *,
     islands: Islands = "auto",
+    nodes: int | None = None,
     gpus: int | None = None,
     seed: int = 1,
     overrides: Mapping[str, Sequence[str]] | None = None,
@@ -52,8 +53,10 @@ def simulate(
         By default the workload card's own.
     islands : int or "auto"
         How many; ``auto`` takes as many as the fewest GPUs that hold the model allow.
+    nodes : int, optional
+        How many of the machine's nodes to use; all by default.
     gpus : int, optional
-        How many of the machine's GPUs to use; all by default.
+        How many GPUs of those to use; all by default.
     seed : int
         Of all random numbers of the traced rays.
     overrides : mapping, optional
@@ -77,16 +80,17 @@ def simulate(
     """
     given = _overrides(overrides or {}, machine, workload)
     card = load_machine(machine, given.get("machine", ())) if isinstance(machine, str) else machine
-    count = check_gpus(card, gpus)
+    count = check_processors(card, nodes, gpus)
     if islands != "auto" and not 1 <= islands <= count:
-        raise UsageError(f"--islands {islands}: {count} GPUs make 1 to {count} islands, or auto")
+        raise UsageError(f"--islands {islands}: {count} {card.processor_noun}s make 1 to {count} islands, or auto")
     check_seed(seed)
     if isinstance(workload, str):
         workload = load_workload(workload, given.get("workload", ()), cache)
     name, scheduler = _policy(policy, workload, given.get("policy", ()))
+    noun = card.processor_noun
     if scheduler.replicated and islands not in {"auto", count}:
         raise UsageError(
-            f"--islands {islands}: {name} holds the whole model on every GPU, so every GPU is an island; "
+            f"--islands {islands}: {name} holds the whole model on every {noun}, so every {noun} is an island; "
             f"use a data-parallel policy such as ray_queue_cycling"
         )
 
@@ -97,6 +101,7 @@ def simulate(
         "workload": workload.name,
         "policy": name,
         "seed": seed,
+        "processor": card.processor_noun,
         "gpus": count,
         "islands": layout.islands,
         "island_size": layout.size,
@@ -105,15 +110,17 @@ def simulate(
         "memory": memory,
     }
     if not chosen.feasible:
-        deciding = [*card.gpu.memory_quantities("machine.gpu."), *workload.card.quantities("workload.published.")]
+        section = f"machine.{card.processor_section}."
+        deciding = [*card.processor.memory_quantities(section), *workload.card.quantities("workload.published.")]
         cause = {"modelled": ["what each GPU must hold"], "left_out": [{"what": "the frame", "why": "it does not fit"}]}
         return Result(**facts, uncalibrated=owned_up(deciding), scope=cause)
 
     env = simpy.Environment()
-    devices = Machine(env, card, layout.ranks, kernels_read=scheduler.kernels_read)
+    devices = Machine(env, card, layout.ranks, kernels_read=scheduler.kernels_read, record=True)
+    names = [devices.processor(index).name for index in range(layout.ranks)]
     trace = workload.trace(seed, progress)
     frame = Frame(
-        env, devices, layout, trace, partition, scheduler, Timeline(layout.ranks),
+        env, devices, layout, trace, partition, scheduler, Timeline(layout.ranks, names),
         visited=lambda generation, start: workload.crossings(seed, partition).domains_visited(generation, start),
         weight=workload.weight, published=workload.card.published.resolution,
     )  # fmt: skip
@@ -192,7 +199,7 @@ def _place(
     card: MachineCard, workload: Workload, policy: Policy, gpus: int, islands: Islands
 ) -> tuple[Fit, Partition, dict[str, Any]]:
     """Choose the islands, and say what each GPU must hold."""
-    footprint = Footprint(float(card.gpu.bvh_triangle_bytes), float(card.gpu.bvh_instance_bytes))
+    footprint = Footprint(float(card.processor.bvh_triangle_bytes), float(card.processor.bvh_instance_bytes))
 
     def parts(size: int) -> Partition:
         return workload.partition(size, footprint, policy.partition, policy.split_share)
@@ -203,7 +210,7 @@ def _place(
         needed: NDArray[np.float64] = model + np.array([sum(b.values()) for b in distinct])[which]
         return needed
 
-    capacity = float(card.gpu.memory - card.gpu.reserved_memory)
+    capacity = float(card.processor.memory - card.processor.reserved_memory)
     chosen = fit(gpus, None if islands == "auto" else islands, need, capacity, replicated=policy.replicated)
     partition = parts(chosen.layout.size)
     fullest = int(chosen.needed_bytes.argmax())
@@ -250,9 +257,9 @@ def _check_devices(frame: Frame, end: int) -> None:
         raise InvariantError("a GPU did two things at once, or went on after the end of the frame")
     if frame.machine.has_network:
         network = frame.machine.network
-        carried = sum(b for name, b in network.carried_bytes.items() if str(name).endswith(".out"))
-        if abs(carried - network.sent_bytes) > 1e-12 * network.sent_bytes:
-            raise InvariantError(f"{network.sent_bytes} B were sent, but the links carried {carried} B")
+        carried, expected = sum(network.carried_bytes.values()), network.sent_link_bytes
+        if abs(carried - expected) > 1e-12 * expected:
+            raise InvariantError(f"the links should have carried {expected} B and carried {carried} B")
 
 
 def _hash(image: NDArray[np.float32]) -> str:

@@ -27,7 +27,9 @@ class Timeline:
     Attributes
     ----------
     gpus : int
-        How many GPUs there are rows for.
+        How many processors there are rows for.
+    names : list of str
+        Theirs; ``gpu0``, ``gpu1`` ... unless given.
     device, kind, start, end : list of int
         Index of the GPU, index into ``KERNELS + COPIES``, and the ticks.
     nbytes, rays : list of float
@@ -36,12 +38,16 @@ class Timeline:
     """
 
     gpus: int
+    names: list[str] = field(default_factory=list)
     device: list[int] = field(default_factory=list)
     kind: list[int] = field(default_factory=list)
     start: list[int] = field(default_factory=list)
     end: list[int] = field(default_factory=list)
     nbytes: list[float] = field(default_factory=list)
     rays: list[float] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.names = self.names or [f"gpu{i}" for i in range(self.gpus)]
 
     def add(self, device: int, kind: int, start: int, end: int, nbytes: float, rays: float) -> None:
         """Log a span."""
@@ -71,7 +77,7 @@ class Timeline:
         names = np.array(KERNELS + COPIES)
         table = pd.DataFrame(
             {
-                "device": [f"gpu{d}" for d in self.device],
+                "device": [self.names[d] for d in self.device],
                 "kind": names[np.array(self.kind, dtype=int)] if self.kind else [],
                 "start_s": np.array(self.start, dtype=float) / TICKS_PER_SECOND,
                 "end_s": np.array(self.end, dtype=float) / TICKS_PER_SECOND,

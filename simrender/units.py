@@ -19,6 +19,7 @@ SECONDS: Final = "s"
 RAYS: Final = "ray"
 BYTES_PER_SECOND: Final = "B/s"
 RAYS_PER_SECOND: Final = "ray/s"
+PRIMITIVES_PER_SECOND: Final = "tri/s"
 NUMBER: Final = "1"
 
 _EXAMPLES: Final = {
@@ -27,6 +28,7 @@ _EXAMPLES: Final = {
     RAYS: ("a number of rays", "'4096 ray'"),
     BYTES_PER_SECOND: ("a bandwidth", "'12.5 GB/s'"),
     RAYS_PER_SECOND: ("a ray rate", "'230 Mray/s'"),
+    PRIMITIVES_PER_SECOND: ("a rate of triangles", "'50 Mtri/s'"),
     NUMBER: ("a number", "'8'"),
 }
 
@@ -44,6 +46,7 @@ def _table() -> dict[str, tuple[str, float]]:
     for prefix, factor in _DECIMAL.items():
         units[f"{prefix}ray"] = (RAYS, factor)
         units[f"{prefix}ray/s"] = (RAYS_PER_SECOND, factor)
+        units[f"{prefix}tri/s"] = (PRIMITIVES_PER_SECOND, factor)
     units.update({s: (SECONDS, f) for s, f in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("µs", 1e-6), ("ns", 1e-9))})
     units["\u03bcs"] = units["µs"]  # the Greek letter, which looks the same
     units["ps"] = (SECONDS, 1e-12)

@@ -224,7 +224,7 @@ def test_a_mesh_that_is_something_else(bad, tmp_path, ending):
         (
             "machine.nvlink.bandwith=300 GB/s",
             "--set machine.nvlink.bandwith: machine.nvlink has no field 'bandwith'; did you mean 'bandwidth'? "
-            "(it has: bandwidth, duplex, latency, kernel_share, distant)",
+            "(it has: bandwidth, duplex, latency, kernel_share, pairs)",
         ),
         (
             "machine.nvlink.bandwidth=3 us",

@@ -156,4 +156,4 @@ def test_the_table_and_the_seconds_agree(drawn):
 def test_the_log_has_no_column_that_the_hash_could_miss():
     """Whoever adds one must add it to the hash, to the table and to this list."""
     fields = [field.name for field in dataclasses.fields(Timeline)]
-    assert fields == ["gpus", "device", "kind", "start", "end", "nbytes", "rays"]
+    assert fields == ["gpus", "names", "device", "kind", "start", "end", "nbytes", "rays"]

@@ -30,7 +30,7 @@ from simrender.hardware.schedules import Schedule, schedule
 
 Color = TypeVar("Color", bound=Hashable)
 
-_schedules = functools.lru_cache(maxsize=32)(schedule)
+_schedules = functools.lru_cache(maxsize=16)(schedule)  # a frame repeats few collectives, and large ones are large
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,86 +2,181 @@
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from functools import cached_property
+from typing import Any, Literal
 
+import numpy as np
 import simpy
 from pydantic import Field, model_validator
 
-from simrender.cards import Bandwidth, Card, Duration, Quantity, Share
+from simrender.cards import Card, Duration, Quantity, Share
 from simrender.catalog import find_card
-from simrender.errors import UsageError
-from simrender.hardware.network import Link, Network
-from simrender.hardware.processor import Host, HostCard, Processor, ProcessorCard
+from simrender.clock import to_ticks
+from simrender.errors import CardError, UsageError, did_you_mean
+from simrender.hardware.collectives import Communicator
+from simrender.hardware.display import DisplayCard
+from simrender.hardware.mpi import MpiCard, Staging, Transport
+from simrender.hardware.network import Network
+from simrender.hardware.processor import CopyEngine, CpuCard, GpuCard, Host, HostCard, Processor
+from simrender.hardware.storage import Storage, StorageCard
+from simrender.hardware.topology import FabricCard, InterconnectCard, NvlinkCard, PcieCard, Topology, check_groups
 
 
-class DistantCard(Card):
-    """Pairs of GPUs that reach only a part of the bandwidth: those in different groups."""
-
-    groups: list[list[int]]
-    share: Share
-
-
-class FabricCard(Card):
-    """What connects the GPUs of one node: NVLink with NVSwitch, or switched PCIe.
+class VariabilityCard(Card):
+    """How nodes that should be equal differ in speed; the slowest one sets the pace of them all.
 
     Attributes
     ----------
-    bandwidth : quantity
-        Of one copy from one GPU to another while nothing else moves.
-    duplex : share
-        A GPU that sends and receives at once reaches this share of twice the bandwidth.
-    latency : quantity
-        Of a copy, from its start on the GPU to its first byte.
-    kernel_share : share
-        Of the bandwidth, for kernels that read a neighbour's memory instead of a copy engine.
-    distant : section, optional
+    spread : share
+        Standard deviation of a node's durations, relative to their mean.
+    distribution : str
+        ``normal``, cut off at three standard deviations, or ``lognormal``, with its long tail of slow nodes.
+    seed : int
+        Each node draws from a stream of its own, so that one more node does not change the others.
 
     """
 
-    bandwidth: Bandwidth
-    duplex: Share
-    latency: Duration
-    kernel_share: Share
-    distant: DistantCard | None = None
+    spread: Share
+    distribution: Literal["normal", "lognormal"] = "normal"
+    seed: int = Field(default=1, ge=0, strict=True)
+
+    def slowness(self, node: int) -> float:
+        """Return what every duration on a node is multiplied by."""
+        draw = np.random.Generator(np.random.Philox(np.random.SeedSequence(self.seed, spawn_key=(node,)))).normal()
+        if self.distribution == "normal":
+            return 1.0 + self.spread * float(np.clip(draw, -3.0, min(3.0, 0.9 / self.spread)))
+        width = np.sqrt(np.log1p(self.spread**2))
+        return float(np.exp(width * draw - 0.5 * width**2))
+
+
+class DisturbanceCard(Card):
+    """A link that slows down, or fails, for a while.
+
+    Attributes
+    ----------
+    link : str
+        A link's name, as the result lists them.
+    share : number
+        Of its bandwidth that is left; 0 is a failure, and what is sent over it then fails.
+    start, end : quantities
+        Simulated time; without an end it stays so.
+
+    """
+
+    link: str
+    share: float = Field(ge=0.0, le=1.0, strict=True)
+    start: Duration
+    end: Duration | None = None
+
+    @model_validator(mode="after")
+    def _ends_later(self) -> DisturbanceCard:
+        if self.end is not None and self.end <= self.start:
+            raise ValueError(f"a disturbance ends after it has begun, got {self.start.text} to {self.end.text}")
+        return self
 
 
 class MachineCard(Card):
-    """A node with several GPUs.
+    """One node with several GPUs, or a cluster of equal nodes.
 
-    Exactly one of ``nvlink`` and ``pcie`` says how the GPUs reach each other.
+    Attributes
+    ----------
+    nodes : int
+        How many a job gets.
+    gpus : int
+        Of each node; none for a machine that renders on its processors.
+    gpu, cpu, host : sections
+        One GPU; the processors of a node; the thread that drives the GPUs.
+    nvlink, pcie : sections
+        What connects the GPUs of a node. Both, if NVLink connects pairs only.
+    network, mpi : sections
+        What connects the nodes, and how programs use it.
+    storage, display : sections
+    variability : section
+        Off unless given.
+    disturbances : list of sections
+
     """
 
     title: str
-    gpus: int = Field(ge=1, strict=True)
-    gpu: ProcessorCard
-    nvlink: FabricCard | None = None
-    pcie: FabricCard | None = None
-    host: HostCard
+    nodes: int = Field(default=1, ge=1, strict=True)
+    gpus: int = Field(default=0, ge=0, strict=True)
+    gpu: GpuCard | None = None
+    cpu: CpuCard | None = None
+    nvlink: NvlinkCard | None = None
+    pcie: PcieCard | None = None
+    host: HostCard | None = None
+    network: InterconnectCard | None = None
+    mpi: MpiCard | None = None
+    storage: StorageCard | None = None
+    display: DisplayCard | None = None
+    variability: VariabilityCard | None = None
+    disturbances: list[DisturbanceCard] = Field(default_factory=list)
 
     @model_validator(mode="after")
-    def _one_fabric(self) -> MachineCard:
-        if (self.nvlink is None) == (self.pcie is None):
-            raise ValueError("a machine has exactly one of the sections nvlink and pcie")
-        if distant := self.fabric.distant:
-            grouped = sorted(gpu for group in distant.groups for gpu in group)
-            if grouped != list(range(self.gpus)):
-                raise ValueError(
-                    f"distant.groups must name each GPU from 0 to {self.gpus - 1} once, got {distant.groups}"
-                )
+    def _whole(self) -> MachineCard:
+        if self.gpus:
+            missing = [name for name in ("gpu", "host") if getattr(self, name) is None]
+            if missing:
+                raise ValueError(f"a machine with GPUs needs the section {' and the section '.join(missing)}")
+        elif self.cpu is None:
+            raise ValueError("a machine has GPUs (gpus and the section gpu) or renders on its processors (section cpu)")
+        if self.nodes > 1 and self.network is None:
+            raise ValueError(f"{self.nodes} nodes need the section network, which says what connects them")
+        self._check_fabrics()
         return self
 
-    @property
-    def fabric(self) -> FabricCard:
-        """The section that connects the GPUs."""
-        fabric = self.nvlink or self.pcie
-        assert fabric is not None  # noqa: S101 - the validator saw to it
-        return fabric
+    def _check_fabrics(self) -> None:
+        nvlink, pcie = self.nvlink, self.pcie
+        if nvlink and nvlink.pairs is None and pcie:
+            raise ValueError(
+                "nvlink connects all GPUs; give its pairs, or leave one of the sections nvlink and pcie out"
+            )
+        if self.gpus > 1 and not pcie and not nvlink:
+            raise ValueError(
+                "a machine with several GPUs needs one of the sections nvlink and pcie, which connect them"
+            )
+        if nvlink and nvlink.pairs is not None and not pcie and self.gpus > 2:
+            raise ValueError("nvlink connects pairs only; the section pcie says how the others reach each other")
+        if nvlink:
+            check_groups("nvlink.pairs", nvlink.pairs, self.gpus, all_named=False)
+        if pcie:
+            check_groups("pcie.switches", pcie.switches, self.gpus)
+            check_groups("pcie.sockets", pcie.sockets, self.gpus)
+            if self.network and pcie.sockets and self.network.socket >= len(pcie.sockets):
+                raise ValueError(f"network.socket is {self.network.socket}, of {len(pcie.sockets)} sockets from 0 on")
 
     @property
-    def fabric_name(self) -> str:
-        """``nvlink`` or ``pcie``."""
-        return "nvlink" if self.nvlink else "pcie"
+    def processor(self) -> GpuCard | CpuCard:
+        """What renders: a GPU if there are any, else the processors of a node."""
+        card = self.gpu if self.gpus else self.cpu
+        assert card is not None  # noqa: S101 - the validator saw to it
+        return card
+
+    @property
+    def processor_section(self) -> str:
+        """``gpu`` or ``cpu``."""
+        return "gpu" if self.gpus else "cpu"
+
+    @property
+    def processor_noun(self) -> str:
+        """What to call what renders: ``GPU`` or ``node``."""
+        return "GPU" if self.gpus else "node"
+
+    @property
+    def node_processors(self) -> int:
+        """How many processors of a node render: its GPUs, or all its cores as one."""
+        return self.gpus or 1
+
+    @property
+    def processors(self) -> int:
+        """How many processors of the machine render."""
+        return self.nodes * self.node_processors
+
+    @property
+    def fabric(self) -> FabricCard | None:
+        """The section that connects the GPUs of a node, where there is one for all of them."""
+        return self.pcie or self.nvlink
 
 
 def load_machine(name: str, overrides: Sequence[str] = ()) -> MachineCard:
@@ -90,7 +185,7 @@ def load_machine(name: str, overrides: Sequence[str] = ()) -> MachineCard:
     Parameters
     ----------
     name : str
-        ``dgx2``, or the path of a YAML file.
+        ``dgx2``, a variant such as ``frontera-rtx:fdr``, or the path of a YAML file.
     overrides : sequence of str
         ``PATH=VALUE`` without the leading ``machine.``.
 
@@ -102,7 +197,18 @@ def load_machine(name: str, overrides: Sequence[str] = ()) -> MachineCard:
     document = find_card("machine", name).document()
     for override in overrides:
         document.override(MachineCard, override, "machine")
-    return document.validate(MachineCard)
+    card = document.validate(MachineCard)
+    links = [str(link) for link in Topology(card, card.nodes).links] if card.disturbances else []
+    mistakes = []
+    for i, entry in enumerate(card.disturbances):
+        if entry.link not in links:
+            where = document.position(("disturbances", i, "link"))
+            where += "" if where.endswith(".") else ": "  # that of a --set ends in the path's beginning
+            near = did_you_mean(entry.link, links)
+            mistakes.append(f"{where}disturbances.{i}.link: there is no link {entry.link!r}{near}")
+    if mistakes:
+        raise CardError(mistakes)
+    return card
 
 
 class Machine:
@@ -112,28 +218,66 @@ class Machine:
     ----------
     env : simpy.Environment
     card : MachineCard
-    gpus : int
-        How many of its GPUs the simulation may use, from 0 on.
+    processors : int
+        How many of its processors the simulation may use, node by node from the first on.
     kernels_read : bool
         Whether kernels will read their neighbours' memory.
+    record : bool
+        Whether to log the load of every link.
 
     """
 
-    def __init__(self, env: simpy.Environment, card: MachineCard, gpus: int, *, kernels_read: bool = False) -> None:
-        self.env, self.card, self.gpus, self.kernels_read = env, card, gpus, kernels_read
-        self.host = Host(env, card.host)
+    def __init__(
+        self,
+        env: simpy.Environment,
+        card: MachineCard,
+        processors: int,
+        *,
+        kernels_read: bool = False,
+        record: bool = False,
+    ) -> None:
+        self.env, self.card, self.kernels_read = env, card, kernels_read
+        self.nodes = -(-processors // card.node_processors)
+        self._count, self._record = processors, record
         self._processors: dict[int, Processor] = {}
+        self._hosts: dict[int, Host] = {}
+        self._engines: dict[tuple[int, int], CopyEngine] = {}
+
+    # -- devices --------------------------------------------------------------------------------------------------
 
     def processor(self, index: int) -> Processor:
-        """Return a GPU, created when first asked for."""
+        """Return a processor, created when first asked for."""
         if index not in self._processors:
-            self._processors[index] = Processor(f"gpu{index}", self.card.gpu)
+            node, place = divmod(index, self.card.node_processors)
+            prefix = f"node{node}." if self.card.nodes > 1 else ""
+            name = f"{prefix}gpu{place}" if self.card.gpus else f"{prefix}cpu"
+            slowness = self.card.variability.slowness(node) if self.card.variability else 1.0
+            self._processors[index] = Processor(name, self.card.processor, slowness)
         return self._processors[index]
 
     @property
     def processors(self) -> list[Processor]:
-        """The GPUs that came into being, in order."""
+        """Those that came into being, in order."""
         return [self._processors[i] for i in sorted(self._processors)]
+
+    def node_of(self, index: int) -> int:
+        """Return the node that a processor is in."""
+        return index // self.card.node_processors
+
+    def host(self, node: int) -> Host:
+        """Return the thread of a node that issues work, created when first asked for."""
+        if node not in self._hosts:
+            self._hosts[node] = Host(self.env, self.card.host or _NO_HOST)
+        return self._hosts[node]
+
+    @property
+    def topology(self) -> Topology:
+        """The links and routes of the nodes in use."""
+        return self._topology
+
+    @cached_property
+    def _topology(self) -> Topology:
+        return Topology(self.card, self.nodes)
 
     @property
     def has_network(self) -> bool:
@@ -142,52 +286,177 @@ class Machine:
 
     @cached_property
     def network(self) -> Network:
-        """The links between the GPUs, created when something is first sent.
+        """The links between the devices, created when something is first sent."""
+        topology = self._topology
+        network = Network(self.env, topology.links, topology.route, nodes=topology.devices, record=self._record)
+        for entry in self.card.disturbances:
+            if entry.link in topology.links:
+                end = None if entry.end is None else to_ticks(entry.end)
+                network.disturb(entry.link, entry.share, to_ticks(entry.start), end)
+        return network
 
-        A copy takes the sender's outgoing lane, the receiver's incoming lane, and a share of each of the two GPUs'
-        ports, which cannot run both lanes at full speed at once. Where kernels read their neighbours' memory, the
-        routes ``i -> (j, "kernel")`` are those of the reads of GPU j.
+    @cached_property
+    def storage(self) -> Storage:
+        """The file systems.
+
+        Raises
+        ------
+        UsageError
+            If the card has none.
+
         """
-        fabric = self.card.fabric
-        lane = float(fabric.bandwidth)
-        links: dict[Hashable, Link] = {}
-        routes: dict[tuple[Hashable, Hashable], Sequence[Hashable]] = {}
-        for i in range(self.gpus):
-            links[f"gpu{i}.out"] = Link(lane, 0.0)
-            links[f"gpu{i}.in"] = Link(lane, 0.0)
-            links[f"gpu{i}.port"] = Link(2.0 * lane * fabric.duplex, 0.5 * fabric.latency)
-        group_of = {gpu: g for g, group in enumerate(fabric.distant.groups) for gpu in group} if fabric.distant else {}
-        for i in range(self.gpus):
-            for j in range(self.gpus):
-                if i == j:
-                    continue
-                route = [f"gpu{i}.out", f"gpu{i}.port", f"gpu{j}.port", f"gpu{j}.in"]
-                reach = lane
-                if fabric.distant and group_of[i] != group_of[j]:
-                    reach = lane * fabric.distant.share
-                    links[f"gpu{i}-gpu{j}"] = Link(reach, 0.0)
-                    route.insert(2, f"gpu{i}-gpu{j}")
-                routes[i, j] = tuple(route)
-                if self.kernels_read:
-                    links[f"gpu{j}.reads.gpu{i}"] = Link(reach * fabric.kernel_share, 0.0)
-                    routes[i, (j, "kernel")] = (*route, f"gpu{j}.reads.gpu{i}")
-        return Network(self.env, links, routes)
+        if self.card.storage is None:
+            raise UsageError(f"{self.card.title} has no storage on its card; add a section storage")
+        return Storage(self.env, self.network, self.card.storage)
+
+    # -- moving data ----------------------------------------------------------------------------------------------
+
+    def copy(self, source: int, target: int, nbytes: float, *, start: int | None = None) -> simpy.Event:
+        """Copy from one processor's memory to another's with the source's copy engines.
+
+        A copy between GPUs of different nodes is a message: straight from one to the other where the adapter can, else
+        staged through the memory of both hosts, which costs two more links and the time of the first and last piece.
+
+        Parameters
+        ----------
+        source, target : int
+        nbytes : float
+        start : int, optional
+            The earliest tick; now, unless given.
+
+        Returns
+        -------
+        simpy.Event
+            Its value is the tick at which the last byte has arrived.
+
+        """
+        begin = int(self.env.now) if start is None else start
+        delay = self._staging.delay_ticks(nbytes) if self._topology.staged(source, target) else 0
+
+        def transfer(tick: int) -> simpy.Event:
+            return self.network.transfer(source, target, nbytes, start=tick, delay=delay)
+
+        return self._engine(source).submit(transfer, begin)
+
+    def _engine(self, index: int) -> CopyEngine:
+        """Return the copy engine of a processor that is idle, or else the next in turn."""
+        card = self.card.gpu if self.card.gpus else None
+        engines = [
+            self._engines.setdefault((index, i), CopyEngine(self.env)) for i in range(card.copy_engines if card else 1)
+        ]
+        return next((engine for engine in engines if engine.idle), engines[0])
+
+    def read(self, source: int, reader: int, nbytes: float, *, start: int | None = None) -> simpy.Event:
+        """Have a kernel read another GPU's memory, which uses a link less well than a copy engine.
+
+        Parameters
+        ----------
+        source, reader : int
+        nbytes : float
+        start : int, optional
+            The tick at which the kernel begins; now, unless given.
+
+        """
+        share = self.card.fabric.kernel_share if self.card.fabric else 1.0
+        cap = share * self.network.bandwidth(source, reader)
+        return self.network.transfer(source, reader, nbytes, start=start, cap=cap)
+
+    def read_counters(self) -> simpy.Event:
+        """Have each host read a counter from each of its processors, and all hosts learn all of them."""
+        per_node, now = self.card.node_processors, int(self.env.now)
+        shares = [min(per_node, self._count - node * per_node) for node in range(self.nodes)]
+        ticks = [self.host(node).read_counters(share) for node, share in enumerate(shares)]
+        if self.nodes == 1:
+            return self.env.timeout(ticks[0] - now)
+        return self.env.all_of([self.env.process(self._tell(node, tick)) for node, tick in enumerate(ticks)])
+
+    def _tell(self, node: int, tick: int) -> Generator[simpy.Event, Any, None]:
+        yield self.env.timeout(tick - int(self.env.now))
+        yield self._host_ranks.rank(node).allgather(_COUNTER_BYTES * self.card.node_processors)
+
+    @cached_property
+    def _host_ranks(self) -> Communicator:
+        return self.communicator(hosts=True)
+
+    @cached_property
+    def _staging(self) -> Staging:
+        network, host = self.card.network, self.card.host
+        block = float(network.staging_block or 0.0) if network else 0.0
+        return Staging(
+            block, float(host.from_device or 0.0) if host else 0.0, float(host.to_device or 0.0) if host else 0.0
+        )
+
+    def communicator(self, ranks: Sequence[int] | None = None, *, hosts: bool = False) -> Communicator:
+        """Return an MPI communicator of processors, or of the hosts of the nodes.
+
+        Parameters
+        ----------
+        ranks : sequence of int, optional
+            Processors, or nodes; all of them by default.
+        hosts : bool
+            One rank a node, with its data in the host's memory.
+
+        Raises
+        ------
+        UsageError
+            If the card does not say which MPI there is.
+
+        """
+        if self.card.mpi is None:
+            raise UsageError(f"{self.card.title} has no MPI on its card; add a section mpi")
+        chosen = list(range(self.nodes if hosts else self._count) if ranks is None else ranks)
+        nodes = chosen if hosts else [self.node_of(i) for i in chosen]
+        endpoints = [("host", n) for n in chosen] if hosts else chosen
+        combined = self.card.cpu if hosts or not self.card.gpus else self.card.gpu
+        # Combining reads two operands and writes one.
+        bandwidth = combined.memory_bandwidth / 3.0 if combined else np.inf
+        direct = hosts or not self.card.gpus or (self.card.network is not None and self.card.network.gpu_direct)
+        transport = Transport(
+            self.network, self.card.mpi, endpoints, node_of=nodes, reduce_bandwidth=bandwidth,
+            staging=None if direct or len(set(nodes)) == 1 else self._staging,
+        )  # fmt: skip
+        return Communicator(self.env, transport)
+
+    # -- provenance -----------------------------------------------------------------------------------------------
 
     def quantities(self) -> Iterator[tuple[str, Quantity]]:
         """Yield the card's quantities that the simulation really used, with their paths."""
         card = self.card
-        for name, quantity in card.gpu.quantities("machine.gpu."):
-            yield name, quantity
-        for name, quantity in card.host.quantities("machine.host."):
-            yield name, quantity
-        if self.has_network:
-            for name, quantity in card.fabric.quantities(f"machine.{card.fabric_name}."):
-                if self.kernels_read or not name.endswith(".kernel_share"):
-                    yield name, quantity
+        yield from card.processor.quantities(f"machine.{card.processor_section}.")
+        if card.host and self._hosts:
+            yield from card.host.quantities("machine.host.")
+        if card.variability:
+            yield from card.variability.quantities("machine.variability.")
+        if not self.has_network:
+            return
+        for name in ("nvlink", "pcie"):
+            for path, quantity in getattr(card, name).quantities(f"machine.{name}.") if getattr(card, name) else ():
+                if self.kernels_read or not path.endswith(".kernel_share"):
+                    yield path, quantity
+        if self.nodes > 1:
+            for name in ("network", "mpi"):
+                if section := getattr(card, name):
+                    yield from section.quantities(f"machine.{name}.")
+        if "storage" in self.__dict__ and card.storage:
+            yield from card.storage.quantities("machine.storage.")
 
 
-def check_gpus(card: MachineCard, gpus: int | None) -> int:
-    """Return how many GPUs to use, all by default.
+_COUNTER_BYTES = 4.0
+_NOTHING = Quantity(0.0, "0 s")
+_NO_HOST = HostCard(launch_issue=_NOTHING, copy_issue=_NOTHING, readback=_NOTHING)
+"""Cores need no thread that drives them."""
+
+
+def check_processors(card: MachineCard, nodes: int | None, gpus: int | None) -> int:
+    """Return how many processors to use, all by default.
+
+    Parameters
+    ----------
+    card : MachineCard
+    nodes : int or None
+        Use only so many nodes.
+    gpus : int or None
+        Use only so many GPUs of those, node by node from the first on.
 
     Raises
     ------
@@ -195,8 +464,14 @@ def check_gpus(card: MachineCard, gpus: int | None) -> int:
         If the machine does not have that many, or none are asked for.
 
     """
+    if nodes is not None and not 1 <= nodes <= card.nodes:
+        raise UsageError(f"--nodes {nodes}: {card.title} has 1 to {card.nodes} nodes to use")
+    available = (card.nodes if nodes is None else nodes) * card.node_processors
     if gpus is None:
-        return card.gpus
-    if not 1 <= gpus <= card.gpus:
-        raise UsageError(f"--gpus {gpus}: {card.title} has 1 to {card.gpus} GPUs to use")
+        return available
+    if not card.gpus:
+        raise UsageError(f"--gpus {gpus}: {card.title} has no GPUs; --nodes says how many nodes to use")
+    if not 1 <= gpus <= available:
+        of = "" if nodes is None else f" in {nodes} nodes"
+        raise UsageError(f"--gpus {gpus}: {card.title} has 1 to {available} GPUs to use{of}")
     return gpus

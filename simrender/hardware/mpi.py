@@ -7,9 +7,11 @@ model", SPAA 1995) with its gap replaced by the fluid network.
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import math
 from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -20,6 +22,7 @@ from simrender.cards import Card, Count, Duration, Quantity, Size
 from simrender.clock import TICK_NOISE, TICKS_PER_SECOND, to_seconds, to_ticks
 from simrender.errors import ScheduleError, did_you_mean
 from simrender.hardware.network import Listener, Network
+from simrender.hardware.schedules import INSTEAD, usable
 
 Flavour = Literal["mpich", "openmpi", "mvapich2"]
 
@@ -92,6 +95,32 @@ class MpiCard(Card):
         return ranges
 
 
+@dataclass(frozen=True)
+class Staging:
+    """Messages of GPUs that go through the memory of both hosts, in pieces.
+
+    Copying a piece overlaps with sending the one before, so a message takes as long as its slowest stage, and beside
+    that the time in which the first piece comes into the host's memory and the last one leaves that of the other.
+
+    Attributes
+    ----------
+    block_bytes : float
+        A piece.
+    from_device, to_device : float
+        Bandwidth of a copy between a GPU and the host's memory, in B/s; 0 where the card does not say.
+
+    """
+
+    block_bytes: float
+    from_device: float
+    to_device: float
+
+    def delay_ticks(self, nbytes: float) -> int:
+        """Return what the two copies add to the latency of a message."""
+        piece = min(nbytes, self.block_bytes) if self.block_bytes else nbytes
+        return to_ticks(sum(piece / bandwidth for bandwidth in (self.from_device, self.to_device) if bandwidth))
+
+
 class Transport:
     """Messages between ranks, each of which is a node of a network.
 
@@ -106,6 +135,8 @@ class Transport:
         feel the card's ranges.
     reduce_bandwidth : float
         At which a rank combines what it received with its own, in B/s.
+    staging : Staging, optional
+        Messages between nodes are staged through host memory.
 
     Attributes
     ----------
@@ -128,6 +159,7 @@ class Transport:
         *,
         node_of: Sequence[int] | None = None,
         reduce_bandwidth: float = math.inf,
+        staging: Staging | None = None,
     ) -> None:
         if not endpoints:
             raise ScheduleError("a transport needs at least one endpoint")
@@ -136,16 +168,13 @@ class Transport:
         if not reduce_bandwidth > 0.0:
             raise ScheduleError(f"reduce_bandwidth must be above zero, got {reduce_bandwidth!r} B/s")
         self.network, self.card, self.reduce_bandwidth = network, card, reduce_bandwidth
+        self.staging = staging
         self.size = len(endpoints)
         self.overhead_ticks = to_ticks(card.overhead)
         self._endpoints = list(endpoints)
-        self._node_of = np.asarray(range(self.size) if node_of is None else node_of)
-        # A size below the first range falls into row 0, where nothing changes.
-        self._above = np.array([float(r.above) for r in card.ranges])
-        self._shares = np.array([math.inf, *(float(r.bandwidth) for r in card.ranges)])
-        self._shares[self._shares >= 1.0] = math.inf
-        self._factors = np.array([1.0, *(float(r.latency) for r in card.ranges)])
-        self._routes: dict[tuple[int, int], tuple[float, int]] = {}
+        self._node_of = list(range(self.size) if node_of is None else node_of)
+        self._above = [float(r.above) for r in card.ranges]
+        self._limits_of: dict[tuple[float, int], list[tuple[float, int]]] = {}
 
     def post(
         self,
@@ -175,20 +204,21 @@ class Transport:
             As `Network.post`.
 
         """
-        nodes = self._endpoints
-        ends = [nodes[rank] for rank in sources.tolist()], [nodes[rank] for rank in targets.tolist()]
-        if len(self._above):
-            caps, delays = self._limits(sources, targets, nbytes)
-            self.network.post(*ends, nbytes, starts, listener, keys, caps=caps, delays=delays)
-        else:
+        nodes, senders, receivers = self._endpoints, sources.tolist(), targets.tolist()
+        ends = [nodes[rank] for rank in senders], [nodes[rank] for rank in receivers]
+        if not self._above and self.staging is None:
             self.network.post(*ends, nbytes, starts, listener, keys)
+            return
+        limits = [self._limit(*message) for message in zip(senders, receivers, nbytes.tolist(), strict=True)]
+        caps, delays = zip(*limits, strict=True) if limits else ((), ())
+        self.network.post(*ends, nbytes, starts, listener, keys, caps=caps, delays=delays)
 
     def alpha_beta(self, source: int, target: int, nbytes: float) -> tuple[float, float]:
         """Return what a message costs that has the links to itself: seconds before its first byte, seconds a byte."""
-        bandwidth, latency = self._route(source, target)
-        caps, delays = self._limits(np.array([source]), np.array([target]), np.array([float(nbytes)]))
-        alpha_s = to_seconds(self.overhead_ticks + latency + int(delays[0]))
-        return alpha_s, 1.0 / min(bandwidth, float(caps[0]))
+        ends = self._endpoints[source], self._endpoints[target]
+        cap, delay = self._limit(source, target, nbytes)
+        alpha_s = to_seconds(self.overhead_ticks + self.network.latency_ticks(*ends) + delay)
+        return alpha_s, 1.0 / min(self.network.bandwidth(*ends), cap)
 
     def reduce_seconds(self, nbytes: float) -> float:
         """Return how long a rank takes to combine received bytes with its own."""
@@ -198,24 +228,28 @@ class Transport:
         """Return `reduce_seconds` of each of many, in ticks."""
         return _whole_ticks(np.asarray(nbytes, np.float64) / self.reduce_bandwidth * TICKS_PER_SECOND)
 
-    def _limits(
-        self, sources: NDArray[Any], targets: NDArray[Any], nbytes: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Return the most that each message gets in B/s, and its latency beside the route's in ticks."""
-        row = np.searchsorted(self._above, nbytes, side="right")
-        row[self._node_of[sources] == self._node_of[targets]] = 0
-        routes = np.array([self._route(*pair) for pair in zip(sources.tolist(), targets.tolist(), strict=True)])
-        bandwidths, latencies = routes.T
-        delays = _whole_ticks(self._factors[row] * latencies) - latencies.astype(np.int64)
-        return self._shares[row] * bandwidths, delays
-
-    def _route(self, source: int, target: int) -> tuple[float, int]:
-        """Return bandwidth and latency in ticks of the route between two ranks."""
-        route = self._routes.get((source, target))
-        if route is None:
-            ends = self._endpoints[source], self._endpoints[target]
-            route = self._routes[source, target] = self.network.bandwidth(*ends), self.network.latency_ticks(*ends)
-        return route
+    def _limit(self, source: int, target: int, nbytes: float) -> tuple[float, int]:
+        """Return the most that a message gets in B/s, and its latency beside the route's in ticks."""
+        if self._node_of[source] == self._node_of[target]:
+            return math.inf, 0
+        staged = self.staging.delay_ticks(nbytes) if self.staging else 0
+        row = bisect.bisect_right(self._above, nbytes)
+        if not row:
+            return math.inf, staged
+        ends = self._endpoints[source], self._endpoints[target]
+        route = self.network.bandwidth(*ends), self.network.latency_ticks(*ends)
+        limits = self._limits_of.get(route)
+        if limits is None:  # routes of a machine differ in little else than their links
+            bandwidth, latency = route
+            limits = self._limits_of[route] = [
+                (
+                    bandwidth * r.bandwidth if r.bandwidth < 1.0 else math.inf,
+                    int(_whole_ticks(np.array(r.latency * latency))) - latency,
+                )
+                for r in self.card.ranges
+            ]
+        cap, delay = limits[row - 1]
+        return cap, delay + staged
 
 
 def _whole_ticks(ticks: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -250,7 +284,7 @@ _Row = tuple[float | str, tuple[_Switch, ...]]
 # - trees and chains (linear, chain, pipeline, binary, split binary, k-nomial): binomial. Without segments, which is how
 #   Open MPI's fixed rules call them, they differ in fan-out alone;
 # - segmented ring: ring; its segments change what is combined while the rest is under way, not what is sent;
-# - allreduce by reduce and bcast ("nonoverlapping"), below a few KiB: recursive_doubling;
+# - allreduce by reduce and bcast ("nonoverlapping"), up to 128 KiB: recursive_doubling;
 # - reduce_scatter by a whole reduce, and by a butterfly: recursive_halving; by a ring: pairwise, which sends as much;
 # - all-to-all, linear-sync: linear, for by default it has no limit on what is under way. Two-proc: pairwise;
 #   scatter-dest: scattered; recursive doubling: bruck;
@@ -438,8 +472,6 @@ def choose(flavour: str, collective: str, ranks: int, nbytes: float) -> str:
         If there is no such flavour or collective.
 
     """
-    from simrender.hardware.schedules import INSTEAD, usable
-
     for name, known in ((flavour, list(_TABLES)), (collective, list(_MPICH))):
         if name not in known:
             kind = "flavour of MPI" if known[0] == "mpich" else "collective"

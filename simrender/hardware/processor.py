@@ -1,33 +1,31 @@
-"""Processors: kernels that run one after the other, a memory that cannot be exceeded, and the host that issues them."""
+"""Processors: kernels and copies, a memory that cannot be exceeded, and the host that issues the work."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable, Generator
+from typing import Any, cast
 
 import simpy
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
-from simrender.cards import Bandwidth, Card, Count, Duration, Quantity, RayCount, RayRate, Size
+from simrender.cards import Bandwidth, Card, Count, Duration, PrimitiveRate, Quantity, RayCount, RayRate, Size
 from simrender.clock import to_ticks
 from simrender.errors import ScheduleError
 
 
 class ProcessorCard(Card):
-    """One GPU, as the cards of `hardware_models` describe it.
+    """What traces rays: a GPU, or all cores of a node together.
 
     The rates are those of a ray query against ``rate_primitives`` triangles. `bvh_triangle_bytes` and
     `bvh_instance_bytes` are the constants of the ray queue cycling paper's weight estimate (section 4.1).
     """
 
     model: str
-    ray_tracing_cores: bool
     memory: Size
     reserved_memory: Size
     memory_bandwidth: Bandwidth
     launch_latency: Duration
-    coherent_rate: RayRate
-    incoherent_rate: RayRate
     rate_primitives: Count
     half_saturation: RayCount
     bvh_triangle_bytes: Size
@@ -47,22 +45,140 @@ class ProcessorCard(Card):
         return self
 
 
+class GpuCard(ProcessorCard):
+    """One GPU.
+
+    Attributes
+    ----------
+    copy_engines : int
+        Copies that can be under way at once, beside the kernels.
+    build_rate : quantity, optional
+        Triangles a second that go into an acceleration structure.
+
+    """
+
+    ray_tracing_cores: bool
+    coherent_rate: RayRate
+    incoherent_rate: RayRate
+    copy_engines: int = Field(default=2, ge=1, strict=True)
+    build_rate: PrimitiveRate | None = None
+
+
+class CpuCard(ProcessorCard):
+    """The processors of one node, whose cores work on everything together.
+
+    Attributes
+    ----------
+    sockets, cores : int
+        Of the node; the cores of all its sockets.
+    core_coherent_rate, core_incoherent_rate, core_parse_bandwidth, core_build_rate : quantities
+        Of one core while all of them work.
+
+    """
+
+    sockets: int = Field(ge=1, strict=True)
+    cores: int = Field(ge=1, strict=True)
+    core_coherent_rate: RayRate
+    core_incoherent_rate: RayRate
+    core_parse_bandwidth: Bandwidth
+    core_build_rate: PrimitiveRate
+
+    @property
+    def coherent_rate(self) -> float:
+        """Camera rays a second on all cores."""
+        return self.cores * self.core_coherent_rate
+
+    @property
+    def incoherent_rate(self) -> float:
+        """Secondary rays a second on all cores."""
+        return self.cores * self.core_incoherent_rate
+
+    @property
+    def parse_bandwidth(self) -> float:
+        """Bytes a second of a scene file that all cores turn into triangles."""
+        return self.cores * self.core_parse_bandwidth
+
+    @property
+    def build_rate(self) -> float:
+        """Triangles a second that go into an acceleration structure."""
+        return self.cores * self.core_build_rate
+
+
 class HostCard(Card):
-    """The one thread that issues work to all GPUs of a machine."""
+    """The thread of a node that issues work to its GPUs, and the way between its memory and theirs.
+
+    Attributes
+    ----------
+    launch_issue, copy_issue : quantities
+        How long it takes to issue a kernel or a copy.
+    readback : quantity
+        To wait for a GPU and read a counter from it.
+    to_device, from_device : quantities, optional
+        Bandwidth of a copy between pinned host memory and a GPU.
+    copy_latency : quantity
+        Of such a copy, until its first byte.
+
+    """
 
     launch_issue: Duration
     copy_issue: Duration
     readback: Duration
+    to_device: Bandwidth | None = None
+    from_device: Bandwidth | None = None
+    copy_latency: Duration = Quantity(0.0, "0 s")
 
 
-@dataclass(slots=True)
+class CopyEngine:
+    """A GPU's engine for copies, which run one after the other and beside the kernels."""
+
+    def __init__(self, env: simpy.Environment) -> None:
+        self._env = env
+        self._last: simpy.Event | None = None
+
+    @property
+    def idle(self) -> bool:
+        """Whether all copies submitted so far are done."""
+        return self._last is None or self._last.processed
+
+    def submit(self, begin: Callable[[int], simpy.Event], not_before: int) -> simpy.Event:
+        """Run a copy when the one before is done; return what happens when it has arrived.
+
+        Parameters
+        ----------
+        begin : callable
+            Starts the copy at a tick and returns its event.
+        not_before : int
+            The earliest tick.
+
+        """
+        if self.idle:
+            self._last = begin(not_before)
+        else:
+            self._last = self._env.process(self._after(cast("simpy.Event", self._last), begin, not_before))
+        return self._last
+
+    def _after(
+        self, previous: simpy.Event, begin: Callable[[int], simpy.Event], not_before: int
+    ) -> Generator[simpy.Event, Any, Any]:
+        yield previous
+        return (yield begin(max(not_before, int(self._env.now))))
+
+
 class Processor:
-    """A GPU with one stream: a kernel begins when it has been issued and its predecessor is done.
+    """A GPU, or the cores of a node: kernels run one after the other, in one stream or in several.
+
+    A kernel begins when it has been issued, its predecessor in its stream is done and no other kernel runs: a kernel
+    that traces rays fills the processor, so streams let kernels overlap with copies and not with each other.
+
+    Parameters
+    ----------
+    name : str
+    card : GpuCard or CpuCard
+    slowness : float
+        By which every duration is multiplied: nodes differ.
 
     Attributes
     ----------
-    name : str
-    card : ProcessorCard
     free_at : int
         The tick at which the last kernel issued so far ends.
     busy_ticks : int
@@ -71,11 +187,12 @@ class Processor:
 
     """
 
-    name: str
-    card: ProcessorCard
-    free_at: int = 0
-    busy_ticks: int = 0
-    allocated_bytes: float = 0.0
+    def __init__(self, name: str, card: GpuCard | CpuCard, slowness: float = 1.0) -> None:
+        self.name, self.card, self.slowness = name, card, slowness
+        self.free_at = 0
+        self.busy_ticks = 0
+        self.allocated_bytes = 0.0
+        self._streams: dict[int, int] = {}
 
     @property
     def capacity_bytes(self) -> float:
@@ -124,16 +241,19 @@ class Processor:
         """Return how long a kernel runs that is bound by the memory it reads and writes."""
         return self.card.launch_latency + nbytes / self.card.memory_bandwidth
 
-    def run(self, seconds: float, not_before: int) -> tuple[int, int]:
+    def run(self, seconds: float, not_before: int, stream: int = 0) -> tuple[int, int]:
         """Queue a kernel and return the ticks at which it begins and ends."""
-        begin = max(self.free_at, not_before)
-        self.free_at = begin + to_ticks(seconds)
+        begin = max(self.free_at, self._streams.get(stream, 0), not_before)
+        self.free_at = self._streams[stream] = begin + to_ticks(seconds * self.slowness)
         self.busy_ticks += self.free_at - begin
         return begin, self.free_at
 
-    def hold(self, until: int) -> None:
-        """Keep the next kernel from starting before a tick: the last one still waits for data it reads."""
-        self.free_at = max(self.free_at, until)
+    def hold(self, until: int, stream: int | None = None) -> None:
+        """Keep the next kernel, of one stream or of all, from starting before a tick: its data are on their way."""
+        if stream is None:
+            self.free_at = max(self.free_at, until)
+        else:
+            self._streams[stream] = max(self._streams.get(stream, 0), until)
 
 
 class Host:

@@ -216,7 +216,7 @@ class Barrier:
         self._brought: list[Any] = [None] * self._ranks
 
     def arrive(
-        self, rank: int, after: list[simpy.Event], bring: Any = None, closing: Callable[[], int] | None = None
+        self, rank: int, after: list[simpy.Event], bring: Any = None, closing: Callable[[], simpy.Event] | None = None
     ) -> simpy.Event:
         """Announce a rank that is ready when all the given events have happened; return what it must wait for.
 
@@ -227,7 +227,7 @@ class Barrier:
         bring : object, optional
             The event's value is the list of what each rank brought.
         closing : callable, optional
-            Called when the last rank is ready; returns the tick at which they all go on.
+            Called when the last rank is ready; they all go on when the event that it returns has happened.
 
         """
         event, brought = self._event, self._brought
@@ -244,9 +244,8 @@ class Barrier:
             if self._missing > 0:
                 return
             self._begin()
-            delay = closing() - int(self._env.now) if closing else 0
-            if delay:
-                self._env.timeout(delay).callbacks.append(lambda _: _succeed(event, brought))
+            if closing:
+                closing().callbacks.append(lambda _: _succeed(event, brought))
             else:
                 event.succeed(brought)
 

@@ -50,7 +50,7 @@ class Rank:
     def __init__(self, frame: Frame, index: int) -> None:
         self._frame, self.index = frame, index
         self._gpu = frame.machine.processor(index)
-        self._host = frame.machine.host
+        self._host = frame.machine.host(frame.machine.node_of(index))
         layout = frame.layout
         self.domain, self.island_size = layout.domain(index), layout.size
         self.left, self.right = layout.left(index), layout.right(index)
@@ -143,7 +143,7 @@ class Rank:
         issued = self._host.issue_copy()
         begin = max(self._gpu.free_at, issued)
         nbytes = len(rays) * frame.policy.ray_bytes * frame.weight
-        copy = frame.machine.network.transfer(self.index, to, nbytes, start=begin)
+        copy = frame.machine.copy(self.index, to, nbytes, start=begin)
         frame.outbox[to, self._shifts] = rays
         yield from self.synchronize(copy)
         frame.timeline.add(self.index, COPY, begin, _arrival(copy), nbytes, len(rays) * frame.weight)
@@ -169,7 +169,7 @@ class Rank:
         rays = self._arrived()
         nbytes = len(rays) * frame.policy.ray_bytes * frame.weight
         begin, end, looking = self._trace(rays)
-        read = frame.machine.network.transfer(self.left, (self.index, "kernel"), nbytes, start=begin)
+        read = frame.machine.read(self.left, self.index, nbytes, start=begin)
         yield from self.synchronize(read)
         frame.timeline.add(self.index, TRACE, begin, end, nbytes, looking)
         arrived = _arrival(read)
@@ -188,9 +188,7 @@ class Rank:
         """Wait for all ranks, let the host read their queue counters, and return them as `Counts`."""
         frame = self._frame
         mine = (len(rays) - rays.shadows, rays.shadows, len(self._pixels))
-        all_read = frame.barrier.arrive(
-            self.index, self._done(), mine, lambda: frame.machine.host.read_counters(frame.layout.ranks)
-        )
+        all_read = frame.barrier.arrive(self.index, self._done(), mine, frame.machine.read_counters)
         by_rank = yield all_read
         counts = Counts(*(list(column) for column in zip(*by_rank, strict=True)))
         if self.index == 0:
@@ -236,6 +234,6 @@ class Rank:
             return
         yield from self._turn()
         begin = max(self._gpu.free_at, self._host.issue_copy())
-        copy = frame.machine.network.transfer(self.index, 0, nbytes, start=begin)
+        copy = frame.machine.copy(self.index, 0, nbytes, start=begin)
         yield from self.synchronize(copy)
         frame.timeline.add(self.index, MERGE, begin, _arrival(copy), nbytes, 0.0)

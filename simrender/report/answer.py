@@ -62,14 +62,15 @@ def _calibration(result: Result) -> Text:
 
 
 def _islands(result: Result) -> str:
-    islands = f"{result.islands} of {result.island_size} GPU{'s' if result.island_size != 1 else ''}"
-    return f"{islands}; {result.unused_gpus} of {result.gpus} GPUs unused" if result.unused_gpus else islands
+    noun = result.processor
+    islands = f"{result.islands} of {result.island_size} {noun}{'s' if result.island_size != 1 else ''}"
+    return f"{islands}; {result.unused_gpus} of {result.gpus} {noun}s unused" if result.unused_gpus else islands
 
 
 def _memory(result: Result) -> str:
     m = result.memory
     needed, capacity, model = (format_bytes(m[f"{key}_bytes"]) for key in ("needed", "capacity", "model"))
-    return f"{needed} of {capacity} on the fullest GPU, {model} of it the model"
+    return f"{needed} of {capacity} on the fullest {result.processor}, {model} of it the model"
 
 
 def _bar(breakdown: dict[str, float]) -> Text:
@@ -95,15 +96,16 @@ def _rays(result: Result) -> str:
 def _infeasible(result: Result) -> list[Any]:
     m, needed = result.memory, result.memory["gpus_needed"]
     need, capacity = format_bytes(m["needed_bytes"]), format_bytes(m["capacity_bytes"])
-    islands, gpus = ("s" if n != 1 else "" for n in (result.islands, result.island_size))
-    size = f"{result.islands} island{islands} of {result.island_size} GPU{gpus}"
-    why = "one part of the model cannot be split" if result.island_size > 1 else "every GPU would hold all of it"
+    noun = result.processor
+    islands, many = ("s" if n != 1 else "" for n in (result.islands, result.island_size))
+    size = f"{result.islands} island{islands} of {result.island_size} {noun}{many}"
+    why = "one part of the model cannot be split" if result.island_size > 1 else f"every {noun} would hold all of it"
     lines = [
         Text(f"{result.workload} does not fit on {result.machine} under {result.policy}", style="bold red"),
-        Text(f"In {size}, the fullest GPU would need {need} and has {capacity}."),
+        Text(f"In {size}, the fullest {noun} would need {need} and has {capacity}."),
     ]
     if needed is None:
-        lines.append(Text(f"No number of such GPUs would do: {why}."))
+        lines.append(Text(f"No number of such {noun}s would do: {why}."))
     else:
-        lines.append(Text(f"{needed} such GPUs would do."))
+        lines.append(Text(f"{needed} such {noun}s would do."))
     return lines

@@ -22,7 +22,7 @@ def chrome_trace(result: Result) -> dict[str, Any]:
     if log is None:
         return {"traceEvents": events}
     for gpu in range(log.gpus):
-        events.append(_name("process_name", gpu, 0, f"gpu{gpu}"))
+        events.append(_name("process_name", gpu, 0, log.names[gpu]))
         events.append({"ph": "M", "name": "process_sort_index", "pid": gpu, "tid": 0, "args": {"sort_index": gpu}})
         events.append(_name("thread_name", gpu, 1, "kernels"))
         events.append(_name("thread_name", gpu, 2, "copies"))

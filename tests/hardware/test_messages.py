@@ -1,0 +1,183 @@
+"""Messages between ranks, against MPI's rules of matching."""
+
+import itertools
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from simrender.hardware.collectives import Communicator, Message
+from tests.crossbar import ALL_EAGER, LATENCY, NONE_EAGER, US, check, crossbar
+
+
+def test_an_eager_message_and_a_rendezvous():
+    env, comm = crossbar(2, eager="4000 B")
+    sends = [comm.rank(0).isend(1, 4000.0, tag=3), comm.rank(0).isend(1, 8000.0)]
+    got = []
+
+    def receiver():
+        yield env.timeout(50 * US)
+        one, other = comm.rank(1).irecv(0, 3), comm.rank(1).irecv(0, 0)
+        got.extend([(yield one), (yield other)])
+
+    env.process(receiver())
+    env.run()
+    # The eager one has been there for long; the other leaves an overhead after its receiver is ready.
+    assert got == [Message(0, 3, 4000.0, 50 * US), Message(0, 0, 8000.0, 50 * US + US + LATENCY + 8 * US)]
+    assert [send.value for send in sends] == [US, 61 * US]
+    assert comm.unmatched() == ""
+
+
+def test_messages_of_one_rank_leave_an_overhead_apart():
+    env, comm = crossbar(4)
+    sends = [comm.rank(0).isend(target, 4000.0) for target in (1, 2, 3)]
+    receives = [comm.rank(target).irecv() for target in (1, 2, 3)]
+    env.run()
+    assert [send.value for send in sends] == [US, 2 * US, 3 * US]
+    assert [receive.value.tick for receive in receives] == [7 * US, 8 * US, 9 * US]
+
+
+def test_a_message_to_oneself():
+    env, comm = crossbar(2, eager="10 B")
+    me = comm.rank(1)
+    events = [me.isend(1, 10.0), me.isend(1, 11.0), me.irecv(), me.irecv()]
+    env.run()
+    assert [event.value for event in events[2:]] == [Message(1, 0, 10.0, US), Message(1, 0, 11.0, 2 * US)]
+
+
+def test_a_small_message_does_not_overtake_a_large_one_of_the_same_sender():
+    for tag in (None, 5):
+        env, comm = crossbar(2)
+        receives = [comm.rank(1).irecv(0, tag) for _ in range(2)]
+        comm.rank(0).isend(1, 1e6, tag=5)
+        comm.rank(0).isend(1, 1.0, tag=5)
+        env.run()
+        assert [receive.value.nbytes for receive in receives] == [1e6, 1.0]
+        assert receives[0].value.tick == receives[1].value.tick > 1000 * US
+
+
+def test_a_rendezvous_waits_for_an_eager_message_before_it():
+    env, comm = crossbar(2, eager="4000 B")
+    receives = [comm.rank(1).irecv(), comm.rank(1).irecv()]
+    comm.rank(0).isend(1, 4000.0)
+    comm.rank(0).isend(1, 8000.0)
+    env.run()
+    assert [receive.value.tick for receive in receives] == [7 * US, 7 * US + US + LATENCY + 8 * US]
+
+
+def test_one_with_another_tag_may_be_received_first():
+    env, comm = crossbar(2)
+    large, small = comm.rank(1).irecv(0, tag=1), comm.rank(1).irecv(0, tag=2)
+    comm.rank(0).isend(1, 1e6, tag=1)
+    comm.rank(0).isend(1, 1.0, tag=2)
+    env.run()
+    assert large.value.tick > 1000 * US > small.value.tick
+
+
+def test_a_receive_from_anybody_takes_what_comes_first():
+    env, comm = crossbar(3)
+    receives = [comm.rank(2).irecv() for _ in range(2)]
+    comm.rank(0).isend(2, 1e6)
+    comm.rank(1).isend(2, 4000.0)
+    env.run()
+    assert [receive.value.source for receive in receives] == [1, 0]
+
+
+def test_a_receive_from_anybody_that_comes_late_takes_what_was_there_first():
+    env, comm = crossbar(3)
+    comm.rank(0).isend(2, 9000.0)
+    comm.rank(1).isend(2, 4000.0)
+    env.run()
+    receives = [comm.rank(2).irecv() for _ in range(2)]
+    env.run()
+    assert [receive.value.source for receive in receives] == [1, 0]
+
+
+def test_receives_are_served_in_the_order_of_posting():
+    env, comm = crossbar(2)
+    anything, sevens = comm.rank(1).irecv(), comm.rank(1).irecv(tag=7)
+    comm.rank(0).isend(1, 1.0, tag=7)
+    env.run()
+    assert anything.processed
+    assert not sevens.triggered
+    assert comm.unmatched() == "a receive of rank 1 from any rank, tag 7 never got a message"
+
+
+def test_what_was_never_received():
+    env, comm = crossbar(3)
+    comm.rank(0).isend(1, 4000.0, tag=2)
+    comm.rank(2).irecv(1)
+    env.run()
+    assert comm.unmatched() == (
+        "a message of 4000 B, tag 2, from rank 0 to rank 1 was never received\n"
+        "a receive of rank 2 from rank 1, any tag never got a message"
+    )
+
+
+def test_communicators_do_not_see_each_others_messages():
+    env, comm = crossbar(2)
+    twin = Communicator(env, comm.transport)
+    comm.rank(0).isend(1, 1.0)
+    receive = twin.rank(1).irecv()
+    env.run()
+    assert not receive.triggered
+
+
+@st.composite
+def conversations(draw):
+    """Sends of (source, target, bytes, tag, start), and for each a receive of (target, source, tag, start)."""
+    size = draw(st.integers(1, 4))
+    rank, start = st.integers(0, size - 1), st.integers(0, 40)
+    sends = draw(
+        st.lists(
+            st.tuples(rank, rank, st.sampled_from([0.0, 1.0, 4000.0, 50000.0]), st.integers(0, 1), start), max_size=14
+        )
+    )
+    order = draw(st.permutations(range(len(sends))))
+    receives = [(sends[i][1], sends[i][0], sends[i][3], draw(start)) for i in order]
+    return size, sends, receives, draw(st.sampled_from([ALL_EAGER, NONE_EAGER, "4000 B"]))
+
+
+def converse(case, wildcards):
+    size, sends, receives, eager = case
+    env, comm = crossbar(size, eager=eager)
+    order, got = [], []
+
+    def sender(number, source, target, nbytes, tag, start):
+        yield env.timeout(start * US)
+        order.append(number)
+        yield comm.rank(source).isend(target, nbytes, tag)
+
+    def receiver(target, source, tag, start):
+        yield env.timeout(start * US)
+        posted = (env.now, len(got))
+        got.append(None)
+        message = yield comm.rank(target).irecv(None if wildcards else source, None if wildcards else tag)
+        assert message.tick == env.now >= posted[0]
+        got[posted[1]] = (target, message)
+
+    for number, send in enumerate(sends):
+        env.process(sender(number, *send))
+    for receive in receives:
+        env.process(receiver(*receive))
+    env.run()
+    return comm, [sends[number] for number in order], got
+
+
+@check
+@given(conversations())
+def test_receives_that_name_their_sender_and_tag_get_its_messages_in_order(case):
+    comm, sent, got = converse(case, wildcards=False)
+    assert comm.unmatched() == ""
+    for target, source, tag in itertools.product(range(4), range(4), range(2)):
+        sizes = [n for s, t, n, g, _ in sent if (s, t, g) == (source, target, tag)]
+        assert sizes == [m.nbytes for t, m in got if (t, m.source, m.tag) == (target, source, tag)]
+
+
+@check
+@given(conversations())
+def test_receives_of_anything_get_every_message_once_and_none_of_a_sender_overtakes(case):
+    comm, sent, got = converse(case, wildcards=True)
+    assert comm.unmatched() == ""
+    for target, source in itertools.product(range(4), range(4)):
+        messages = [(n, g) for s, t, n, g, _ in sent if (s, t) == (source, target)]
+        assert messages == [(m.nbytes, m.tag) for t, m in got if (t, m.source) == (target, source)]
