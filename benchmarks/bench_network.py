@@ -1,10 +1,11 @@
-"""How fast the network is: flows that meet nobody, rings in which everybody meets, and the solver by itself.
+"""How fast the network is: flows that meet nobody, rings and stars in which everybody meets, the solver by itself.
 
 Each asserts how many events it took or how many flows it rated, so that it tells a slower machine from more work.
 """
 
 import math
 
+import numpy as np
 import simpy
 
 from simrender.hardware.maxmin import max_min_rates
@@ -43,11 +44,11 @@ def ring(stagger, stages=STAGES):
 
 
 def test_a_ring_whose_flows_start_together(benchmark):
-    assert benchmark(ring, 0) == (4269, 7088)
+    assert benchmark(ring, 0) == (4339, 7088)
 
 
 def test_a_ring_whose_flows_start_one_after_another(benchmark):
-    assert benchmark(ring, 1_000_000) == (6044, 19431)
+    assert benchmark(ring, 1_000_000) == (6349, 19431)
 
 
 def test_transfers_that_meet_nobody(benchmark):
@@ -74,6 +75,58 @@ def test_ten_thousand_flows_that_end_together(benchmark):
         return run(env), net.reratings
 
     assert benchmark(burst) == (10_002, 10_000)
+
+
+def star(ranks):
+    """Return a network of ranks around a switch."""
+    links = {(way, i): Link(12.5e9, 1e-6) for way in ("up", "down") for i in range(ranks)}
+    return Network(simpy.Environment(), links, lambda i, j: (("up", i), ("down", j)))
+
+
+def test_an_all_to_all_of_88_ranks_in_which_every_size_differs(benchmark):
+    # 7,656 flows at once, in one component; they end at 7,656 ticks.
+    ranks = 88
+    sources, targets = np.nonzero(~np.eye(ranks, dtype=bool))
+    sizes = np.random.default_rng(1).uniform(1e4, 1e6, len(sources))
+
+    def exchange():
+        net, calls = star(ranks), []
+        zeros = np.zeros(len(sizes), np.int64)
+        net.post(sources.tolist(), targets.tolist(), sizes, zeros, lambda keys, _: calls.append(len(keys)), zeros)
+        run(net._env)
+        return net.flows_finished, len(calls), net.reratings
+
+    assert benchmark(exchange) == (7656, 7656, 14_429_259)
+
+
+def pairwise(ranks, stages, size):
+    """Have each rank send to the one so many further on, one stage after the other, each when it has received."""
+    net, at = star(ranks), np.ones(ranks, np.int64)
+
+    def arrived(receivers, tick):
+        at[receivers] += 1
+        send(receivers[at[receivers] <= stages], tick)
+
+    def send(senders, tick):
+        targets = (senders + at[senders]) % ranks
+        starts = np.full(len(senders), tick)
+        net.post(senders.tolist(), targets.tolist(), size(senders, targets), starts, arrived, targets)
+
+    send(np.arange(ranks), 0)
+    run(net._env)
+    return net.flows_finished, net.reratings
+
+
+def test_a_pairwise_all_to_all_of_1024_ranks_in_step(benchmark):
+    # A million messages, each pair once.
+    result = benchmark.pedantic(pairwise, (1024, 1023, lambda s, _: np.full(len(s), 1e4)), rounds=1)
+    assert result == (1024 * 1023, 1024 * 1023)
+
+
+def test_a_pairwise_all_to_all_of_256_ranks_out_of_step(benchmark):
+    # Sizes differ, so each message comes and goes at a tick of its own.
+    result = benchmark.pedantic(pairwise, (256, 255, lambda s, t: 1e4 + (7919 * t + 104729 * s) % 4999), rounds=1)
+    assert result == (256 * 255, 254_857)
 
 
 def test_the_solver_on_a_fat_tree(benchmark):

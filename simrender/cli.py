@@ -10,14 +10,14 @@ import re
 import sys
 import time  # noqa: TID251 - wall time is measured here, for a person, and never simulated
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from cyclopts import App, CycloptsError, Parameter, Token, UnusedCliTokensError
 
-from simrender.errors import SimrenderError, UsageError
+from simrender.errors import SimrenderError, UnitError, UsageError
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -42,6 +42,9 @@ def _whole(_type: Any, tokens: Sequence[Token]) -> int:
 
 MOST_DOMAINS = 1024
 """Rows that `simrender trace --domains` will print."""
+
+_MOST_BYTES = 1e12
+"""Of a message or vector that `simrender network` is asked for; what takes months has no place in 64-bit ticks."""
 
 Set = Annotated[tuple[str, ...], Parameter(name="--set", negative="", show_default=False)]
 Flag = Annotated[Path | None, Parameter(negative="")]
@@ -89,19 +92,24 @@ def list_(kind: Literal["machines", "workloads", "policies"] | None = None, /) -
 
 
 @app.command
-def show(name: str, /) -> None:
+def show(name: str, /, *, plot: Flag = None) -> None:
     """Show a machine's or workload's card with the source of every value, or a policy with its parameters.
 
     Parameters
     ----------
     name
         Of a machine, a workload or a policy, or the path of a card; NAME:VARIANT shows a variant of a card.
+    plot
+        Draw what connects a machine's devices (.png, .svg or .pdf).
 
     """
     from simrender import catalog
     from simrender.errors import UnknownNameError
     from simrender.report.cards import describe_card
 
+    if plot:
+        _plot_machine(name, plot)
+        return
     policies = catalog.policies()
     if name in policies:
         _show_policy(name)
@@ -252,6 +260,141 @@ def run(
     return 0 if result.feasible else 3
 
 
+@app.command
+def network(
+    machine: str,
+    pattern: str,
+    /,
+    *,
+    bytes_: Annotated[str | None, Parameter(name="--bytes")] = None,
+    ranks: str | None = None,
+    algorithm: str | None = None,
+    from_: Annotated[Whole | None, Parameter(name="--from")] = None,
+    to: Whole | None = None,
+    nodes: Whole | None = None,
+    hosts: Annotated[bool | None, Parameter(negative="")] = None,
+    resolution: str | None = None,
+    copy_threads: str | None = None,
+    message_pixels: Whole | None = None,
+    display_nodes: Whole | None = None,
+    tiles: Annotated[bool | None, Parameter(negative="")] = None,
+    frames: Whole | None = None,
+    set_: Set = (),
+    json: Annotated[str | None, Parameter(negative="")] = None,
+) -> None:
+    """Ask the network alone: how long a collective, a message, or a frame on its way into the display takes.
+
+    Parameters
+    ----------
+    machine
+        Name or path of a machine's card.
+    pattern
+        barrier, bcast, reduce, allreduce, allgather, alltoall, gather, reduce-scatter, or with a v (allgatherv, ...);
+        transfer, one message between two ranks; display.
+    bytes_
+        Sizes, such as 1KiB,4MiB: the whole vector, or what each rank contributes; by default 1KiB,64KiB,4MiB.
+    ranks
+        How many, such as 8,88, one a GPU (or a node without GPUs), node by node from the first on; all by default.
+    algorithm
+        Of the collective; by default the one that the machine's MPI would take.
+    from_
+        The rank that sends the transfer; 0 by default.
+    to
+        The rank that gets it; 1 by default.
+    nodes
+        Use only so many of the machine's nodes.
+    hosts
+        One rank a node, with its data in the host's memory.
+    resolution
+        Of the display's image; 1920x1080 by default.
+    copy_threads
+        Of a display node, such as 1,2,3,4; by default the card's.
+    message_pixels
+        Of a full message to the display; by default the card's.
+    display_nodes
+        That share the image; by default the card's.
+    tiles
+        Send rectangular tiles with one location each, instead of one for each pixel.
+    frames
+        To measure on the display; 100 by default.
+    set_
+        Change a value of the card: PATH=VALUE, where PATH starts with machine.
+    json
+        Write the answer as JSON to a file, or to stdout (-).
+
+    """
+    from simrender.cards import split_assignments
+    from simrender.hardware.machine import load_machine
+    from simrender.hardware.questions import check_ranks, find_pattern
+    from simrender.report import network as report
+
+    pattern = find_pattern(pattern)
+    _refuse_others(
+        pattern,
+        {
+            "a collective": {"--ranks": ranks, "--algorithm": algorithm},
+            "a collective or transfer": {"--bytes": bytes_, "--nodes": nodes, "--hosts": hosts},
+            "transfer": {"--from": from_, "--to": to},
+            "display": {
+                "--resolution": resolution, "--copy-threads": copy_threads, "--message-pixels": message_pixels,
+                "--display-nodes": display_nodes, "--tiles": tiles, "--frames": frames,
+            },
+        },
+    )  # fmt: skip
+    if pattern == "barrier" and bytes_ is not None:
+        raise UsageError(f"--bytes {bytes_}: a barrier sends none")
+    if json is not None and json != "-":
+        from simrender.report.files import check_target
+
+        check_target("--json", Path(json), (".json",))
+    given = None if algorithm is None else algorithm.replace("-", "_")
+    size = _resolution(resolution or "1920x1080")
+    sizes = _sizes(bytes_ or "1KiB,64KiB,4MiB") if pattern != "barrier" else [0.0]
+    counts: list[int] | list[None] = [None] if ranks is None else _counts("--ranks", ranks)
+    threads: list[int] | list[None] = [None] if copy_threads is None else _counts("--copy-threads", copy_threads)
+    card = load_machine(machine, split_assignments(set_, ("machine",))["machine"])
+    begin = time.perf_counter()
+    if pattern == "display":
+        from simrender.hardware.questions import ask_display
+
+        reports = [
+            ask_display(
+                card, size, frames=100 if frames is None else frames, copy_threads=count,
+                message_pixels=message_pixels, nodes=display_nodes, tiles=bool(tiles),
+            )
+            for count in threads
+        ]  # fmt: skip
+        value: dict[str, Any] = report.display_dict(machine, card, reports)
+        shown = report.describe_display(machine, card, size, reports)
+    else:
+        from simrender.hardware.questions import ask_collective, ask_transfer
+
+        if pattern == "transfer":
+            ends = from_ or 0, 1 if to is None else to
+            answers = [ask_transfer(card, nbytes, *ends, nodes=nodes, hosts=bool(hosts)) for nbytes in sizes]
+        else:
+            answers = [
+                ask_collective(card, pattern, count, nbytes, algorithm=given, hosts=bool(hosts))
+                for count in [check_ranks(card, nodes, count, hosts=bool(hosts)) for count in counts]
+                for nbytes in sizes
+            ]
+        value = report.network_dict(machine, card, answers, given=given)
+        shown = report.describe_network(machine, card, answers, given=given)
+    seconds = time.perf_counter() - begin
+    if json == "-":
+        import json as encoder
+
+        print(encoder.dumps(value, indent=1))  # noqa: T201 - the answer itself
+    else:
+        _console().print(shown)
+        if json:
+            from simrender.report.files import write_json
+
+            write_json(Path(json), value)
+            _note(f"wrote {json}")
+    _note(f"simulated in {seconds:.2f} s")
+
+
 def _publish(result: Result, json: str | None) -> None:
     if json == "-":
         import json as encoder
@@ -268,6 +411,43 @@ def _publish(result: Result, json: str | None) -> None:
         _note(f"wrote {json}")
 
 
+def _refuse_others(pattern: str, options: Mapping[str, Mapping[str, object]]) -> None:
+    """Refuse options of other patterns; they are listed by those that they go with."""
+    kind = pattern if pattern in {"transfer", "display"} else "a collective"
+    for kinds, values in options.items():
+        for option, value in values.items():
+            if value is not None and kind not in kinds.split(" or "):
+                raise UsageError(f"{option} goes with {kinds}, not with {pattern}")
+
+
+def _sizes(text: str) -> list[float]:
+    """Read sizes, separated by commas."""
+    from simrender.units import BYTES, parse
+
+    try:
+        sizes = [parse(part, BYTES) for part in text.split(",")]
+    except UnitError as error:
+        raise UsageError(f"--bytes {text}: {error}") from None
+    if not all(0.0 <= size <= _MOST_BYTES for size in sizes):
+        raise UsageError(f"--bytes {text}: expected 0 B to 1 TB")
+    return sizes
+
+
+def _counts(option: str, text: str) -> list[int]:
+    """Read whole numbers, separated by commas."""
+    parts = [part.strip() for part in text.split(",")]
+    if not all(re.fullmatch("[0-9]{1,18}", part) and int(part) for part in parts):
+        raise UsageError(f"{option} {text}: expected whole numbers from 1 on, separated by commas, such as 1,2,4")
+    return [int(part) for part in parts]
+
+
+def _resolution(text: str) -> tuple[int, int]:
+    match = re.fullmatch("([1-9][0-9]{0,8})x([1-9][0-9]{0,8})", text)
+    if match is None:
+        raise UsageError(f"--resolution {text}: expected WIDTHxHEIGHT in pixels such as 2560x1080")
+    return int(match[1]), int(match[2])
+
+
 def _islands(text: str) -> int | Literal["auto"]:
     if text == "auto":
         return "auto"
@@ -275,6 +455,26 @@ def _islands(text: str) -> int | Literal["auto"]:
         return int(text)
     except ValueError:
         raise UsageError(f"--islands {text}: expected a number of islands, or auto") from None
+
+
+def _plot_machine(name: str, path: Path) -> None:
+    from simrender import catalog
+    from simrender.errors import UnknownNameError
+    from simrender.hardware.machine import load_machine
+    from simrender.report.files import check_target, write_figure
+
+    check_target("--plot", path, (".png", ".svg", ".pdf"))
+    try:
+        card = load_machine(name)
+    except UnknownNameError:
+        for kind, known in (("workload", catalog.cards("workload")), ("policy", catalog.policies())):
+            if name in known:
+                raise UsageError(f"--plot {path}: {name} is a {kind}; only machines are drawn") from None
+        raise
+    from simrender.report.topology import plot_topology  # matplotlib is slow to import
+
+    write_figure(path, plot_topology(card))
+    _note(f"wrote {path}")
 
 
 def _show_policy(name: str) -> None:

@@ -277,7 +277,9 @@ class Document:
                 break
             if isinstance(target, dict) and default is not None:
                 target.setdefault(part, default)
-            target = target.get(part) if isinstance(target, dict) else target[int(part)]
+            outer, target = target, target.get(part) if isinstance(target, dict) else target[int(part)]
+            if target is None and depth == len(parts) - 2 and _stands_alone(shape, parts[-1]):
+                target = outer[part] = {}
             if target is None:
                 twins = [dotted((section, *p)) for p in self.keys if p[-1] == parts[-1]]
                 hint = f"; did you mean {', '.join(twins)}?" if twins else ""
@@ -459,6 +461,14 @@ def _default(shape: Any, part: str | int) -> dict[str, Any] | None:
         return None
     default = shape.model_fields[str(part)].get_default(call_default_factory=True, validated_data={})
     return {} if isinstance(default, BaseModel) else dict(default) if isinstance(default, dict) else None
+
+
+def _stands_alone(shape: Any, part: str | int) -> bool:
+    """Tell whether a section that is not there would be complete with one field."""
+    shape = _without_optional(shape)
+    if not (isinstance(shape, type) and issubclass(shape, BaseModel)):
+        return False
+    return [name for name, field in shape.model_fields.items() if field.is_required()] == [part]
 
 
 def _fields_at(model: Any, path: Path) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -52,6 +53,9 @@ class Result:
         Share of the frame during which each device computes.
     breakdown : dict
         Share of the frame that an average GPU spends on each kind of work, on copies, and waiting. Sums to 1.
+    links : dict
+        What each link that carried something did: ``bandwidth_bytes_per_s``, ``carried_bytes``, ``busy_s``, and of that
+        bandwidth the ``mean_utilization`` over the frame and the ``peak_utilization``.
     counts : dict
         Rays, tests, bytes, kernels; ``published`` in a name means real ones, otherwise traced ones.
     sampling_error : dict
@@ -61,6 +65,10 @@ class Result:
     scope : dict
         ``modelled`` and ``left_out``, with reasons.
     image_sha256, event_log_sha256 : str or None
+    image : float32 array (height, width, 3) or None
+    spans : Timeline or None
+    loads : dict
+        Of the same links, the ticks at which a load changed (int64 array), and the B/s from then on (float64 array).
 
     """
 
@@ -77,6 +85,7 @@ class Result:
     memory: dict[str, Any]
     frame_time_s: float | None = None
     utilization: dict[str, float] = field(default_factory=dict)
+    links: dict[str, dict[str, float]] = field(default_factory=dict)
     breakdown: dict[str, float] = field(default_factory=dict)
     counts: dict[str, float] = field(default_factory=dict)
     sampling_error: dict[str, Any] = field(default_factory=dict)
@@ -86,6 +95,12 @@ class Result:
     event_log_sha256: str | None = None
     image: NDArray[np.float32] | None = None
     spans: Timeline | None = None
+    loads: dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]] = field(default_factory=dict)
+
+    @property
+    def busiest_link(self) -> str | None:
+        """The link with the highest mean utilization, the first of equal ones; None if nothing was sent."""
+        return max(self.links, key=lambda name: self.links[name]["mean_utilization"], default=None)
 
     @property
     def frames_per_s(self) -> float | None:
@@ -98,8 +113,8 @@ class Result:
         return (self.spans or Timeline(0)).frame()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything but the image and the timeline, ready for JSON."""
-        names = [n for n in self.__dataclass_fields__ if n not in {"image", "spans"}]
+        """Return everything but the image, the timeline and the loads of the links, ready for JSON."""
+        names = [n for n in self.__dataclass_fields__ if n not in {"image", "spans", "loads"}]
         facts = {name: getattr(self, name) for name in names}
         place = names.index("frame_time_s") + 1
         return dict([*list(facts.items())[:place], ("frames_per_s", self.frames_per_s), *list(facts.items())[place:]])
@@ -177,6 +192,17 @@ def counts(frame: Frame, machine: Machine) -> dict[str, float]:
         ),
         "network_bytes": machine.network.sent_bytes if machine.has_network else 0.0,
         "spans": len(log),
+    }
+
+
+def links(machine: Machine) -> dict[str, dict[str, float]]:
+    """Return what the links that carried something did."""
+    if not machine.has_network:
+        return {}
+    return {
+        str(name): {"bandwidth_bytes_per_s": float(machine.topology.links[name].bandwidth), **dataclasses.asdict(use)}
+        for name, use in machine.network.use.items()
+        if use.carried_bytes > 0.0
     }
 
 

@@ -22,7 +22,7 @@ from simrender.policies.rank import PIXEL_BYTES, Rank
 from simrender.rays.partition import Footprint, Partition
 from simrender.rays.trace import Progress, Trace
 from simrender.rays.workload import Workload, check_seed, load_workload
-from simrender.result import Result, breakdown, counts, owned_up, sampling_error, scope
+from simrender.result import Result, breakdown, counts, links, owned_up, sampling_error, scope
 from simrender.timeline import Timeline
 
 Islands = int | Literal["auto"]
@@ -115,6 +115,8 @@ def simulate(
         cause = {"modelled": ["what each GPU must hold"], "left_out": [{"what": "the frame", "why": "it does not fit"}]}
         return Result(**facts, uncalibrated=owned_up(deciding), scope=cause)
 
+    if scheduler.kernels_read:
+        _check_reach(card, layout, name)
     env = simpy.Environment()
     devices = Machine(env, card, layout.ranks, kernels_read=scheduler.kernels_read, record=True)
     names = [devices.processor(index).name for index in range(layout.ranks)]
@@ -146,11 +148,14 @@ def simulate(
     if layout.size > 1:
         workload.crossings(seed, partition).save()
 
+    carried = links(devices)
+    loads = devices.network.loads_by_link if devices.has_network else {}
     used = [*devices.quantities(), *workload.card.quantities("workload.")]
     return Result(
         **facts,
         frame_time_s=frame_time_s,
         utilization={p.name: to_seconds(p.busy_ticks) / frame_time_s for p in devices.processors},
+        links=carried,
         breakdown=breakdown(frame.timeline, frame_time_s),
         counts=counts(frame, devices),
         sampling_error=sampling_error(frame),
@@ -160,6 +165,7 @@ def simulate(
         event_log_sha256=frame.timeline.sha256(),
         image=image,
         spans=frame.timeline,
+        loads={str(name): load for name, load in loads.items() if str(name) in carried},
     )
 
 
@@ -223,6 +229,16 @@ def _place(
         "gpus_needed": chosen.gpus_needed,
     }
     return chosen, partition, memory
+
+
+def _check_reach(card: MachineCard, layout: Layout, policy: str) -> None:
+    """Refuse kernels that would read the memory of another node's GPUs."""
+    first = np.arange(layout.islands) * layout.size
+    if (first // card.node_processors != (first + layout.size - 1) // card.node_processors).any():
+        raise UsageError(
+            f"{policy} lets kernels read their neighbours' memory, which they cannot do from node to node, and islands "
+            f"of {layout.size} {card.processor_noun}s lie on several nodes; use policy.copy=explicit"
+        )
 
 
 def _buffers(policy: Policy, workload: Workload, layout: Layout) -> tuple[list[dict[str, float]], NDArray[np.int64]]:

@@ -36,7 +36,7 @@ def bad(run_cli, tmp_path):
 
 
 def test_unknown_names_say_what_is_near(bad, tiny_card):
-    machines = "desktop-rtx8000, dgx2, hgx-a100, rtx-server-a40"
+    machines = "desktop-rtx8000, dgx2, frontera-rtx, hgx-a100, laptop, manta-cluster, rtx-server-a40, stampede2-skx"
     assert bad("run", "dgx3", tiny_card) == f"unknown machine 'dgx3'; did you mean 'dgx2'? (known: {machines})"
     assert bad("run", "dgx2", "xyzzy").startswith("unknown workload 'xyzzy' (known: ")
     message = bad("run", "dgx2", tiny_card, "--policy", "ray_que_cycling")
@@ -46,7 +46,9 @@ def test_unknown_names_say_what_is_near(bad, tiny_card):
 
 
 def test_unknown_words_of_the_command_line(bad, tiny_card):
-    assert bad("rnu") == 'Unknown command "rnu". Did you mean "run"? Available commands: list, show, trace, run.'
+    assert (
+        bad("rnu") == 'Unknown command "rnu". Did you mean "run"? Available commands: list, show, trace, run, network.'
+    )
     assert bad("list", "machine").endswith('Did you mean "machines"?')
     assert bad("run", "dgx2", tiny_card, "--polcy", "x") == "Unknown option: --polcy. Did you mean --policy?"
     assert bad("run", "dgx2").endswith("parameter WORKLOAD requires an argument.")
@@ -258,7 +260,8 @@ def test_a_bad_set(bad, tiny_card, assignment, message):
 def test_a_set_of_another_machines_links(bad, tiny_card):
     message = bad("run", "dgx2", tiny_card, "--set", "machine.pcie.bandwidth=3 GB/s")
     assert message.startswith("--set machine.pcie.bandwidth: ")
-    assert message.endswith("dgx2/card.yaml has no machine.pcie; did you mean machine.nvlink.bandwidth?")
+    assert message.endswith("dgx2/card.yaml has no machine.pcie; did you mean machine.nvlink.bandwidth, "
+                            "machine.storage.local.bandwidth?")  # fmt: skip
 
 
 def test_a_set_of_no_parameter_of_the_policy(bad, tiny_card):

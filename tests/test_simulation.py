@@ -84,7 +84,7 @@ def test_twice_the_rates_halve_the_time(large):
         return [f"{section}.{name}={value:.17g} {unit}" for name, value in values.items()]
 
     text = scaled("gpu", 2, "ray/s", "coherent_rate", "incoherent_rate") + scaled("gpu", 2, "B/s", "memory_bandwidth")
-    text += scaled("pcie", 2, "B/s", "bandwidth", "uplink") + scaled("pcie", 0.5, "s", "latency")
+    text += scaled("pcie", 2, "B/s", "bandwidth", "socket_link") + scaled("pcie", 0.5, "s", "latency")
     text += scaled("gpu", 0.5, "s", "launch_latency")
     text += scaled("host", 0.5, "s", "launch_issue", "copy_issue", "readback")
     slow = simulate("rtx-server-a40", large, islands=2)

@@ -35,6 +35,7 @@ from simrender.hardware.tables import (
     STAMP,
     TOUCHED,
     VACATED,
+    WEIGHT_UNIT,
     WIDOWED,
     WORTH_RESUMING,
     Array,
@@ -117,6 +118,11 @@ def _pull(t: Tables, leader: int) -> None:
 
 
 @kernel
+def _first(t: Tables) -> int:
+    return t.heap[0].tick if t.counters[HEAP_SIZE] else NONE
+
+
+@kernel
 def reheap(t: Tables) -> None:
     """Put the heap in order again after its ticks have changed."""
     for i in range(t.counters[HEAP_SIZE] - 1, -1, -1):
@@ -169,17 +175,25 @@ def _leave(t: Tables, f: int, now: int) -> None:
 
 
 @kernel
-def add_alone(t: Tables, slots: Array) -> None:
-    """Queue flows that use no link: each is a component of its own, and its finish is known."""
+def add_alone(t: Tables, slots: Array) -> int:
+    """Queue flows that use no link: each is a component of its own, and its finish is known.
+
+    Returns the first tick at which any flow arrives.
+    """
     for f in slots:
         t.flows[f].leader, t.flows[f].next = f, NONE
         t.counters[CAPPED] += t.story[f].cap < np.inf
         _push(t, t.flows[f].finish, f)
+    return _first(t)
 
 
 @kernel
-def release(t: Tables, now: int) -> int:
-    """Take the flows that arrive now off their links; return how many, their slots being in ``arrived``."""
+def release(t: Tables, now: int) -> tuple[int, int, bool]:
+    """Take the flows that arrive now off their links.
+
+    Returns how many, their slots being in ``arrived``; the first tick at which another arrives; and whether others have
+    to be rated anew for it.
+    """
     arrived, count = t.arrived, 0
     while t.counters[HEAP_SIZE] > 0 and t.heap[0].tick <= now:
         member = t.heap[0].leader
@@ -219,14 +233,31 @@ def release(t: Tables, now: int) -> int:
                 part = total - t.links[link].carried
                 t.links[link].carried_low += (t.links[link].carried - (total - part)) + (nbytes - part)
                 t.links[link].carried = total
-    return count
+    crowded = False
+    for i in range(t.counters[VACATED]):
+        crowded |= t.links[t.vacated[i]].users > 0
+    if t.counters[PULLED] and not crowded:
+        forget(t)  # either nobody is left, or the component had come apart
+    unsettled = crowded or t.counters[WIDOWED] > 0
+    if not unsettled:
+        _empty_vacated(t, now)
+    return count, _first(t), unsettled
 
 
 @kernel
 def _widow(t: Tables, f: int) -> None:
     """Note a flow that has to be rated anew, since its component is out of the heap."""
+    t.flows[f].leader = NONE  # that one may be gone, and its slot another's
     t.widowed[t.counters[WIDOWED]] = f
     t.counters[WIDOWED] += 1
+
+
+@kernel
+def _widow_all(t: Tables, leader: int) -> None:
+    member = leader
+    while member != NONE:
+        _widow(t, member)
+        member = t.flows[member].next
 
 
 @kernel
@@ -244,12 +275,10 @@ def upset(t: Tables, slots: Array) -> None:
     """Have the components of some flows rated anew at the end of this tick."""
     forget(t)
     for f in slots:
-        member = t.flows[f].leader
-        if t.flows[member].place != NONE:
-            _pull(t, member)
-            while member != NONE:
-                _widow(t, member)
-                member = t.flows[member].next
+        leader = t.flows[f].leader
+        if leader != NONE:
+            _pull(t, leader)
+            _widow_all(t, leader)
 
 
 @kernel
@@ -258,17 +287,21 @@ def evict(t: Tables, slots: Array, now: int) -> None:
     upset(t, slots)
     for f in slots:
         _leave(t, f, now)
-        for i in range(t.counters[WIDOWED]):
-            if t.widowed[i] == f:
-                t.widowed[i] = NONE
+        t.flows[f].weight = 0
+    for i in range(t.counters[WIDOWED]):
+        if t.widowed[i] != NONE and t.flows[t.widowed[i]].weight == 0:
+            t.widowed[i] = NONE
 
 
 # -- rating ----------------------------------------------------------------------------------------------------------
 
 
 @kernel
-def settle(t: Tables, arrivals: Array, now: int) -> None:
-    """Let flows join their links, and rate every component in which a flow has come or gone."""
+def settle(t: Tables, arrivals: Array, now: int) -> int:
+    """Let flows join their links, and rate every component in which a flow has come or gone.
+
+    Returns the first tick at which a flow arrives.
+    """
     t.counters[STAMP] += 1
     for f in arrivals:
         t.flows[f].since = now
@@ -283,11 +316,19 @@ def settle(t: Tables, arrivals: Array, now: int) -> None:
         for f in arrivals:
             if t.flows[f].mark != t.counters[STAMP]:
                 _rate(t, f, now)
-        for i in range(t.counters[WIDOWED]):
+        i = 0
+        while i < t.counters[WIDOWED]:  # which may grow meanwhile
             f = t.widowed[i]
+            i += 1
             if f != NONE and t.flows[f].mark != t.counters[STAMP]:
                 _rate(t, f, now)
     t.counters[WIDOWED] = 0
+    _empty_vacated(t, now)
+    return _first(t)
+
+
+@kernel
+def _empty_vacated(t: Tables, now: int) -> None:
     for i in range(t.counters[VACATED]):
         t.links[t.vacated[i]].vacated = 0
         if t.links[t.vacated[i]].users == 0:
@@ -299,13 +340,16 @@ def settle(t: Tables, arrivals: Array, now: int) -> None:
 def _rate(t: Tables, seed: int, now: int) -> None:
     """Find the component of a flow, give its flows their fair rates, and put it into the heap."""
     n_flows, n_links = _component(t, seed)
-    if n_flows == 1:
-        rate = t.story[seed].cap
+    if n_flows == 1:  # what `fill` would come to, to the bit
+        weight = t.flows[seed].weight * WEIGHT_UNIT
+        level = t.story[seed].cap / weight
         for i in range(n_links):
-            rate = min(rate, t.links[t.touched[i]].capacity)
+            level = min(level, t.links[t.touched[i]].capacity / weight)
+        rate = min(weight * level, t.story[seed].cap)
         for i in range(n_links):
-            _set_load(t, t.touched[i], rate, now)
-        t.flows[seed].leader, t.flows[seed].next = seed, NONE
+            link = t.touched[i]
+            _set_load(t, link, _load(t.links[link].capacity, t.links[link].capacity - weight * level), now)
+        t.flows[seed].leader, t.flows[seed].next, t.flows[seed].apart = seed, NONE, 0
         _change_rate(t, seed, rate, now)
         t.counters[LAST] = NONE
         t.counters[RATED] += 1
@@ -356,8 +400,7 @@ def _finish_rating(t: Tables, first: int, now: int) -> None:
     """Apply the new rates of a component, of its flows from ``first`` on, and put it into the heap."""
     for i in range(t.counters[TOUCHED]):
         link = t.touched[i]
-        capacity, residual = t.links[link].capacity, t.links[link].residual
-        _set_load(t, link, capacity if residual < 1e-12 * capacity else capacity - residual, now)
+        _set_load(t, link, _load(t.links[link].capacity, t.links[link].residual), now)
     order, earliest, listed = t.order, t.earliest, t.counters[LISTED]
     t.counters[LAST], t.counters[PULLED], t.counters[CHANGED] = NONE, 0, NO_ROUND
     if listed == 0:
@@ -380,6 +423,7 @@ def _finish_rating(t: Tables, first: int, now: int) -> None:
         t.flows[f].next = order[i + 1] if i + 1 < listed else NONE
     t.counters[RATED] += listed - first
     t.counters[LAST] = leader
+    t.flows[leader].apart = t.counters[RESUMED]
     _push(t, tick, leader)
 
 
@@ -409,8 +453,11 @@ def _component(t: Tables, seed: int) -> tuple[int, int]:
     while i < n_flows:
         f = queue[i]
         i += 1
-        if t.flows[f].place != NONE:
-            _pull(t, f)
+        leader = t.flows[f].leader
+        if leader != NONE and t.flows[leader].place != NONE:
+            _pull(t, leader)
+            if t.flows[leader].apart:  # some of its flows may not be found from here
+                _widow_all(t, leader)
         for h in range(t.flows[f].hops):
             link = t.hops[f, h]
             if t.links[link].mark != stamp:
@@ -429,6 +476,11 @@ def _component(t: Tables, seed: int) -> tuple[int, int]:
                     entry = t.after[entry]
                 t.links[link].end = n_entries
     return n_flows, n_links
+
+
+@kernel
+def _load(capacity: float, residual: float) -> float:
+    return capacity if residual < 1e-12 * capacity else capacity - residual
 
 
 @kernel

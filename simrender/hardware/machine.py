@@ -19,8 +19,8 @@ from simrender.hardware.display import DisplayCard
 from simrender.hardware.mpi import MpiCard, Staging, Transport
 from simrender.hardware.network import Network
 from simrender.hardware.processor import CopyEngine, CpuCard, GpuCard, Host, HostCard, Processor
-from simrender.hardware.storage import Storage, StorageCard
-from simrender.hardware.topology import FabricCard, InterconnectCard, NvlinkCard, PcieCard, Topology, check_groups
+from simrender.hardware.storage import LoadTimes, Storage, StorageCard, Where
+from simrender.hardware.topology import InterconnectCard, NvlinkCard, PcieCard, Topology, check_groups
 
 
 class VariabilityCard(Card):
@@ -45,7 +45,8 @@ class VariabilityCard(Card):
         """Return what every duration on a node is multiplied by."""
         draw = np.random.Generator(np.random.Philox(np.random.SeedSequence(self.seed, spawn_key=(node,)))).normal()
         if self.distribution == "normal":
-            return 1.0 + self.spread * float(np.clip(draw, -3.0, min(3.0, 0.9 / self.spread)))
+            bound = min(3.0, 0.9 / self.spread)  # nothing takes no time; and both sides alike, so that the mean stays
+            return 1.0 + self.spread * float(np.clip(draw, -bound, bound))
         width = np.sqrt(np.log1p(self.spread**2))
         return float(np.exp(width * draw - 0.5 * width**2))
 
@@ -119,6 +120,8 @@ class MachineCard(Card):
             missing = [name for name in ("gpu", "host") if getattr(self, name) is None]
             if missing:
                 raise ValueError(f"a machine with GPUs needs the section {' and the section '.join(missing)}")
+        elif self.gpu is not None and "gpus" not in self.model_fields_set:
+            raise ValueError("the section gpu goes with gpus, which says how many a node has")
         elif self.cpu is None:
             raise ValueError("a machine has GPUs (gpus and the section gpu) or renders on its processors (section cpu)")
         if self.nodes > 1 and self.network is None:
@@ -172,11 +175,6 @@ class MachineCard(Card):
     def processors(self) -> int:
         """How many processors of the machine render."""
         return self.nodes * self.node_processors
-
-    @property
-    def fabric(self) -> FabricCard | None:
-        """The section that connects the GPUs of a node, where there is one for all of them."""
-        return self.pcie or self.nvlink
 
 
 def load_machine(name: str, overrides: Sequence[str] = ()) -> MachineCard:
@@ -240,8 +238,9 @@ class Machine:
         self.nodes = -(-processors // card.node_processors)
         self._count, self._record = processors, record
         self._processors: dict[int, Processor] = {}
+        self._cpus: dict[int, Processor] = {}
         self._hosts: dict[int, Host] = {}
-        self._engines: dict[tuple[int, int], CopyEngine] = {}
+        self._engines: dict[int, list[CopyEngine]] = {}
 
     # -- devices --------------------------------------------------------------------------------------------------
 
@@ -251,9 +250,11 @@ class Machine:
             node, place = divmod(index, self.card.node_processors)
             prefix = f"node{node}." if self.card.nodes > 1 else ""
             name = f"{prefix}gpu{place}" if self.card.gpus else f"{prefix}cpu"
-            slowness = self.card.variability.slowness(node) if self.card.variability else 1.0
-            self._processors[index] = Processor(name, self.card.processor, slowness)
+            self._processors[index] = Processor(name, self.card.processor, self._slowness(node))
         return self._processors[index]
+
+    def _slowness(self, node: int) -> float:
+        return self.card.variability.slowness(node) if self.card.variability else 1.0
 
     @property
     def processors(self) -> list[Processor]:
@@ -309,13 +310,75 @@ class Machine:
             raise UsageError(f"{self.card.title} has no storage on its card; add a section storage")
         return Storage(self.env, self.network, self.card.storage)
 
+    def cpu(self, node: int) -> Processor:
+        """Return the cores of a node, which parse files whatever else renders, created when first asked for.
+
+        Raises
+        ------
+        UsageError
+            If the card does not say which processors the nodes have.
+
+        """
+        if self.card.cpu is None:
+            raise UsageError(f"{self.card.title} has no processors on its card; add a section cpu")
+        if not self.card.gpus:
+            return self.processor(node)
+        if node not in self._cpus:
+            prefix = f"node{node}." if self.card.nodes > 1 else ""
+            self._cpus[node] = Processor(f"{prefix}cpu", self.card.cpu, self._slowness(node))
+        return self._cpus[node]
+
+    def load(
+        self, index: int, nbytes: float, primitives: float, *, where: Where | None = None
+    ) -> Generator[simpy.Event, Any, LoadTimes]:
+        """Load a domain for a processor: open and read its file, parse it, and build its acceleration structure.
+
+        The cores of the node parse. A GPU that can build does so once the data have been copied to it; else the cores
+        build, and the data are copied all the same.
+
+        Parameters
+        ----------
+        index : int
+            A processor.
+        nbytes : float
+            Size of the domain's file.
+        primitives : float
+            Triangles of the domain.
+        where : "shared" or "local", optional
+            The parallel file system unless there is none.
+
+        Returns
+        -------
+        LoadTimes
+            At the end of ``yield from``.
+
+        Raises
+        ------
+        UsageError
+            If the card has no storage or no processors.
+
+        """
+        storage, node = self.storage, self.node_of(index)
+        cores = self.cpu(node)
+        cpu = self.card.cpu
+        assert cpu is not None  # noqa: S101 - self.cpu saw to it
+        builder, rate = cores, float(cpu.build_rate)
+        if self.card.gpus and self.card.gpu and self.card.gpu.build_rate is not None:
+            builder, rate = self.processor(index), float(self.card.gpu.build_rate)
+        place: Where = where or ("shared" if storage.card.shared else "local")
+        return storage.load(
+            node, nbytes, primitives, (cores, float(cpu.parse_bandwidth)), (builder, rate),
+            device=index if self.card.gpus else None, where=place,
+        )  # fmt: skip
+
     # -- moving data ----------------------------------------------------------------------------------------------
 
     def copy(self, source: int, target: int, nbytes: float, *, start: int | None = None) -> simpy.Event:
         """Copy from one processor's memory to another's with the source's copy engines.
 
         A copy between GPUs of different nodes is a message: straight from one to the other where the adapter can, else
-        staged through the memory of both hosts, which costs two more links and the time of the first and last piece.
+        staged through the memory of both hosts, which costs the links to both hosts, their memory, and the time of the
+        first and last piece.
 
         Parameters
         ----------
@@ -331,7 +394,8 @@ class Machine:
 
         """
         begin = int(self.env.now) if start is None else start
-        delay = self._staging.delay_ticks(nbytes) if self._topology.staged(source, target) else 0
+        between_nodes = self.node_of(source) != self.node_of(target)
+        delay = self._staging.delay_ticks(nbytes) if self._staging and between_nodes else 0
 
         def transfer(tick: int) -> simpy.Event:
             return self.network.transfer(source, target, nbytes, start=tick, delay=delay)
@@ -339,12 +403,12 @@ class Machine:
         return self._engine(source).submit(transfer, begin)
 
     def _engine(self, index: int) -> CopyEngine:
-        """Return the copy engine of a processor that is idle, or else the next in turn."""
-        card = self.card.gpu if self.card.gpus else None
-        engines = [
-            self._engines.setdefault((index, i), CopyEngine(self.env)) for i in range(card.copy_engines if card else 1)
-        ]
-        return next((engine for engine in engines if engine.idle), engines[0])
+        """Return the copy engine of a processor with the fewest copies to do."""
+        engines = self._engines.get(index)
+        if engines is None:
+            count = self.card.gpu.copy_engines if self.card.gpus and self.card.gpu else 1
+            engines = self._engines[index] = [CopyEngine(self.env) for _ in range(count)]
+        return min(engines, key=lambda engine: engine.waiting)
 
     def read(self, source: int, reader: int, nbytes: float, *, start: int | None = None) -> simpy.Event:
         """Have a kernel read another GPU's memory, which uses a link less well than a copy engine.
@@ -357,8 +421,8 @@ class Machine:
             The tick at which the kernel begins; now, unless given.
 
         """
-        share = self.card.fabric.kernel_share if self.card.fabric else 1.0
-        cap = share * self.network.bandwidth(source, reader)
+        fabric = self._topology.fabric(source, reader)
+        cap = (fabric.kernel_share if fabric else 1.0) * self.network.bandwidth(source, reader)
         return self.network.transfer(source, reader, nbytes, start=start, cap=cap)
 
     def read_counters(self) -> simpy.Event:
@@ -379,11 +443,13 @@ class Machine:
         return self.communicator(hosts=True)
 
     @cached_property
-    def _staging(self) -> Staging:
+    def _staging(self) -> Staging | None:
+        """What staging adds to a message between GPUs of different nodes; None where the adapter reaches the GPUs."""
         network, host = self.card.network, self.card.host
-        block = float(network.staging_block or 0.0) if network else 0.0
+        if not self.card.gpus or network is None or host is None or network.gpu_direct:
+            return None
         return Staging(
-            block, float(host.from_device or 0.0) if host else 0.0, float(host.to_device or 0.0) if host else 0.0
+            float(network.staging_block or 0.0), float(host.from_device or 0.0), float(host.to_device or 0.0)
         )
 
     def communicator(self, ranks: Sequence[int] | None = None, *, hosts: bool = False) -> Communicator:
@@ -410,10 +476,9 @@ class Machine:
         combined = self.card.cpu if hosts or not self.card.gpus else self.card.gpu
         # Combining reads two operands and writes one.
         bandwidth = combined.memory_bandwidth / 3.0 if combined else np.inf
-        direct = hosts or not self.card.gpus or (self.card.network is not None and self.card.network.gpu_direct)
         transport = Transport(
             self.network, self.card.mpi, endpoints, node_of=nodes, reduce_bandwidth=bandwidth,
-            staging=None if direct or len(set(nodes)) == 1 else self._staging,
+            staging=None if hosts else self._staging,
         )  # fmt: skip
         return Communicator(self.env, transport)
 
@@ -422,9 +487,18 @@ class Machine:
     def quantities(self) -> Iterator[tuple[str, Quantity]]:
         """Yield the card's quantities that the simulation really used, with their paths."""
         card = self.card
-        yield from card.processor.quantities(f"machine.{card.processor_section}.")
+        loads = "storage" in self.__dict__
+        for path, quantity in card.processor.quantities(f"machine.{card.processor_section}."):
+            if loads or not path.endswith(("build_rate", "parse_bandwidth")):
+                yield path, quantity
+        if self._cpus and card.cpu:
+            yield from card.cpu.quantities("machine.cpu.")
         if card.host and self._hosts:
-            yield from card.host.quantities("machine.host.")
+            carried = self.network.carried_bytes if self.has_network else {}
+            copied = any(nbytes and str(link).endswith((".h2d", ".d2h")) for link, nbytes in carried.items())
+            for path, quantity in card.host.quantities("machine.host."):
+                if copied or not path.endswith(("_device", "copy_latency")):
+                    yield path, quantity
         if card.variability:
             yield from card.variability.quantities("machine.variability.")
         if not self.has_network:
@@ -465,13 +539,17 @@ def check_processors(card: MachineCard, nodes: int | None, gpus: int | None) -> 
 
     """
     if nodes is not None and not 1 <= nodes <= card.nodes:
-        raise UsageError(f"--nodes {nodes}: {card.title} has 1 to {card.nodes} nodes to use")
+        raise UsageError(f"--nodes {nodes}: {card.title} has {_up_to(card.nodes, 'node')} to use")
     available = (card.nodes if nodes is None else nodes) * card.node_processors
     if gpus is None:
         return available
     if not card.gpus:
         raise UsageError(f"--gpus {gpus}: {card.title} has no GPUs; --nodes says how many nodes to use")
     if not 1 <= gpus <= available:
-        of = "" if nodes is None else f" in {nodes} nodes"
-        raise UsageError(f"--gpus {gpus}: {card.title} has 1 to {available} GPUs to use{of}")
+        of = "" if nodes is None else f" in {nodes} node{'s' if nodes > 1 else ''}"
+        raise UsageError(f"--gpus {gpus}: {card.title} has {_up_to(available, 'GPU')} to use{of}")
     return gpus
+
+
+def _up_to(count: int, noun: str) -> str:
+    return f"1 to {count} {noun}s" if count > 1 else f"1 {noun}"

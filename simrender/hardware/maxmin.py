@@ -153,7 +153,7 @@ def max_min_rates(
     flow_links : sequence of sequences of int
         For each flow the indices of the links on its route, none of them twice.
     weights : sequence of float, optional
-        Where two flows share a full link, their rates are as their weights; 1 by default.
+        Where two flows share a full link, their rates are as their weights, to a multiple of 2^-32; 1 by default.
     caps : sequence of float, optional
         The highest rate that each flow can use, in B/s.
 

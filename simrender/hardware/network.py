@@ -8,6 +8,7 @@ TOMACS 23(4), 2013), without its corrections for TCP.
 
 from __future__ import annotations
 
+import itertools
 import math
 import operator
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
@@ -23,7 +24,7 @@ from simrender.clock import TICKS_PER_SECOND, to_seconds, to_ticks
 from simrender.errors import LinkFailedError, ScheduleError, UnreachableError, UsageError, did_you_mean
 from simrender.hardware import fluid
 from simrender.hardware.routing import FewestHops
-from simrender.hardware.tables import FAR, FLOW, HEAP_SIZE, LOGGED, NONE, RATED, STORY, VACATED, WEIGHT_UNIT, Tables
+from simrender.hardware.tables import FAR, FLOW, HEAP_SIZE, LOGGED, NONE, RATED, STORY, WEIGHT_UNIT, Tables
 
 if TYPE_CHECKING:
     import networkx
@@ -35,6 +36,7 @@ _FIRST = EventPriority(NORMAL - 1)
 _LAST = EventPriority(NORMAL + 1)  # after everything that SimPy itself schedules at the same tick
 _HORIZON = FAR // 2
 _MOST_ROUTES = 2**17
+_FEW = 8  # messages sent together, at which it is as fast to send them one by one
 _WEIGHTS = (1.0 / 1024.0, 1024.0)
 
 
@@ -90,15 +92,10 @@ class LinkUse:
 class _Route:
     """The links from one node to another, by index; their latency in ticks; the bandwidth of a flow alone on them."""
 
-    __slots__ = ("bandwidth", "latency", "links", "padded")
+    __slots__ = ("bandwidth", "latency", "links")
 
-    def __init__(self, links: NDArray[np.int32], latency: int, bandwidth: float) -> None:
+    def __init__(self, links: tuple[int, ...], latency: int, bandwidth: float) -> None:
         self.links, self.latency, self.bandwidth = links, latency, bandwidth
-        self.padded: list[int] = []
-
-    def pad(self, width: int) -> None:
-        """Make the row of a table of that width."""
-        self.padded = [*self.links.tolist(), *[0] * (width - len(self.links))]
 
 
 class _Alarm(simpy.Event):
@@ -136,8 +133,8 @@ class Network:
 
     Attributes
     ----------
-    sent_bytes : float
-        Bytes of all transfers asked for so far.
+    sent_bytes, sent_link_bytes : float
+        Bytes of all transfers asked for so far, and what all links together will have carried for them.
     flows_finished : int
         Transfers that have arrived.
 
@@ -157,7 +154,7 @@ class Network:
         nodes: Iterable[Hashable] = (),
         record: bool = False,
     ) -> None:
-        self.sent_bytes = 0.0
+        self.sent_bytes = self.sent_link_bytes = 0.0
         self.flows_finished = 0
         self._env = env
         self._nominal = dict(links)
@@ -256,16 +253,25 @@ class Network:
     def loads(self) -> list[tuple[int, Hashable, float]]:
         """Every change of a link's load: the tick, the link's name, and the sum of the rates through it in B/s."""
         names = list(self._nominal)
-        count = int(self._t.counters[LOGGED])
-        rows = self._t.log[:count].tolist()
-        epoch = 0
-        ends = [*self._epochs, (count + 1, 0)]
-        table = []
-        for i, (tick, link, load) in enumerate(rows):
-            while i >= ends[0][0]:
-                epoch = ends.pop(0)[1]
-            table.append((epoch + tick, names[link], load))
-        return table
+        ticks, links, loads = (column.tolist() for column in self._changes())
+        return [(tick, names[link], load) for tick, link, load in zip(ticks, links, loads, strict=True)]
+
+    @property
+    def loads_by_link(self) -> dict[Hashable, tuple[NDArray[np.int64], NDArray[np.float64]]]:
+        """The same for each link that ever had a load, as arrays: ticks, and B/s from then on."""
+        ticks, links, loads = self._changes()
+        order = np.argsort(links, kind="stable")
+        used, first = np.unique(links[order], return_index=True)
+        names = list(self._nominal)
+        parts = zip(used.tolist(), np.split(ticks[order], first[1:]), np.split(loads[order], first[1:]), strict=False)
+        return {names[link]: (when, load) for link, when, load in parts}
+
+    def _changes(self) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]:
+        """Return the log of loads in three columns: ticks, links by index, B/s."""
+        log = self._t.log[: int(self._t.counters[LOGGED])]
+        rows, epochs = zip((0, 0), *self._epochs, strict=True)
+        begins = np.array(epochs, np.int64 if self._epoch < FAR else object)  # which then do not fit 64 bits
+        return log["tick"] + begins[np.searchsorted(rows, np.arange(len(log)), "right") - 1], log["link"], log["load"]
 
     def latency_ticks(self, source: Hashable, target: Hashable) -> int:
         """Return the latency of the route between two nodes.
@@ -313,7 +319,8 @@ class Network:
         start : int, optional
             The tick at which the sender begins; now, unless given.
         weight : float
-            Where flows share a full link, their rates are as their weights; between 1/1024 and 1024.
+            Where flows share a full link, their rates are as their weights; between 1/1024 and 1024, to a multiple of
+            2^-32.
         cap : float
             The most that this flow gets, in B/s: a copy engine, a protocol.
         delay : int
@@ -333,38 +340,46 @@ class Network:
             If a number is out of range, or the start lies in the past.
 
         """
-        route = self._routes.get((source, target)) or self._route(source, target)
+        pair = (source, target)
+        route = self._routes.get(pair) or self._route(source, target)
         now = cast("int", self._env.now)
-        if not 0.0 <= nbytes < math.inf:
-            raise ScheduleError(f"a transfer's size must be finite and not negative, got {nbytes!r} B")
-        start = now if start is None else operator.index(start)
-        if start < now:
-            raise ScheduleError(f"a transfer cannot start at tick {start}, before now, tick {now}")
+        start, delay = now if start is None else operator.index(start), operator.index(delay)
         if not _WEIGHTS[0] <= weight <= _WEIGHTS[1]:
             raise ScheduleError(f"a transfer's weight must lie between 1/1024 and 1024, got {weight!r}")
-        if not cap > 0.0:
-            raise ScheduleError(f"a transfer's cap must be above zero, got {cap!r} B/s")
-        if delay < 0:
-            raise ScheduleError(f"a transfer's delay must not be negative, got {delay!r} ticks")
+        _check(nbytes, start, cap, delay, now)
+        done = simpy.Event(self._env)
+        self._send(done, 0, pair, route, float(nbytes), start, float(weight), float(cap), delay)
+        return done
+
+    def _send(
+        self,
+        owner: simpy.Event | Listener,
+        key: int,
+        pair: tuple[Hashable, Hashable],
+        route: _Route,
+        nbytes: float,
+        start: int,
+        weight: float,
+        cap: float,
+        delay: int,
+    ) -> None:
         if not self._free:
             self._grow(1)
-        slot = self._free.pop()
-        done = self._owners[slot] = simpy.Event(self._env)
-        self._pairs[slot] = (source, target)
+        t, slot, hops = self._t, self._free.pop(), len(route.links)
+        self._owners[slot], self._pairs[slot], self._keys[slot] = owner, pair, key
         arrival = start + route.latency + delay
         relative = min(arrival - self._epoch, FAR)
-        hops = len(route.links) if nbytes else 0
-        self._t.flows[slot] = (relative, 0, nbytes, 0.0, round(weight / WEIGHT_UNIT), hops, 0, 0, NONE, NONE, NONE)
-        self._t.story[slot] = (cap, nbytes, min(start - self._epoch, FAR), self._started)
-        self._t.hops[slot, : len(route.links)] = route.links
+        joins = hops if nbytes else 0
+        t.flows[slot] = (relative, 0, nbytes, 0.0, round(weight / WEIGHT_UNIT), joins, 0, 0, 0, NONE, NONE, NONE)
+        t.story[slot] = (cap, nbytes, min(start - self._epoch, FAR), self._started)
+        t.hops[slot, :hops] = route.links
         self._started += 1
         self.sent_bytes += nbytes
+        self.sent_link_bytes += nbytes * hops
         if (nbytes and (hops or cap < math.inf)) or relative >= _HORIZON:
             self._settle_at(arrival).append(slot)
         else:
-            fluid.add_alone(self._t, np.array([slot], np.int32))
-            self._arm()
-        return done
+            self._arm(fluid.add_alone(t, np.array([slot], np.int32)))
 
     def post(
         self,
@@ -403,46 +418,59 @@ class Network:
             `LinkFailedError`.
 
         """
-        sizes, begins = np.asarray(nbytes, np.float64), np.asarray(starts, np.int64)
-        count, now = len(sizes), cast("int", self._env.now)
-        if count == 0:
+        now = cast("int", self._env.now)
+        known, pairs = self._routes, list(zip(sources, targets, strict=True))
+        routes = [known.get(pair) or self._route(*pair) for pair in pairs]
+        count = len(pairs)
+        sizes = _column(np.asarray(nbytes, np.float64), count)
+        begins, names = _column(_whole(starts), count), _column(_whole(keys), count)
+        limits = np.full(count, math.inf) if caps is None else _column(np.asarray(caps, np.float64), count)
+        waits = np.zeros(count, np.int64) if delays is None else _column(_whole(delays), count)
+        if count <= _FEW:
+            numbers = list(zip(sizes.tolist(), begins.tolist(), limits.tolist(), waits.tolist(), strict=True))
+            for size, begin, limit, wait in numbers:
+                _check(size, begin, limit, wait, now)
+            for key, pair, route, (size, begin, limit, wait) in zip(
+                names.tolist(), pairs, routes, numbers, strict=True
+            ):
+                self._send(listener, key, pair, route, size, begin, 1.0, limit, wait)
             return
-        known = self._routes
-        routes = [known.get(pair) or self._route(*pair) for pair in zip(sources, targets, strict=True)]
-        if not (np.isfinite(sizes).all() and sizes.min() >= 0.0):
-            raise ScheduleError("a transfer's size must be finite and not negative")
-        if begins.min() < now:
-            raise ScheduleError(f"a transfer cannot start at tick {begins.min()}, before now, tick {now}")
-        ends = begins + np.fromiter((route.latency for route in routes), np.int64, count)
-        if delays is not None:
-            ends += np.asarray(delays, np.int64)
+        good = (sizes >= 0.0) & (sizes < math.inf) & (begins >= now) & (limits > 0.0) & (waits >= 0)
+        if not good.all():
+            bad = int(np.argmin(good))
+            _check(float(sizes[bad]), int(begins[bad]), float(limits[bad]), int(waits[bad]), now)
+        ends = begins + waits + np.fromiter((route.latency for route in routes), np.int64, count)
+        if (ends < begins).any():
+            raise ScheduleError("messages sent together must arrive before tick 2^63")
         if len(self._free) < count:
             self._grow(count)
         slots = self._free[-count:][::-1]
         del self._free[-count:]
         at = np.array(slots, np.int32)
-        rows, stories = np.zeros(count, FLOW), np.zeros(count, STORY)
+        flows, stories = np.zeros(count, FLOW), np.zeros(count, STORY)
         lengths = np.fromiter((len(route.links) for route in routes), np.int64, count)
         stories["start"] = begins - self._epoch
         stories["number"] = np.arange(self._started, self._started + count)
-        stories["nbytes"] = rows["remaining"] = sizes
-        rows["finish"] = ends - self._epoch
-        rows["weight"] = round(1.0 / WEIGHT_UNIT)
-        stories["cap"] = math.inf if caps is None else caps
-        rows["hops"] = np.where(sizes > 0.0, lengths, 0)
-        rows["next"] = rows["leader"] = rows["place"] = NONE
-        self._t.flows[at], self._t.story[at] = rows, stories
-        columns = np.arange(int(lengths.max(initial=0)))
-        self._t.hops[at[:, None], columns] = [route.padded[: len(columns)] for route in routes]
-        self._keys[at] = np.asarray(keys, np.int64)
-        for slot, pair in zip(slots, zip(sources, targets, strict=True), strict=True):
+        stories["nbytes"] = flows["remaining"] = sizes
+        flows["finish"] = ends - self._epoch
+        flows["weight"] = round(1.0 / WEIGHT_UNIT)
+        stories["cap"] = limits
+        flows["hops"] = np.where(sizes > 0.0, lengths, 0)
+        flows["next"] = flows["leader"] = flows["place"] = NONE
+        self._t.flows[at], self._t.story[at] = flows, stories
+        row, column = np.nonzero(np.arange(lengths.max()) < lengths[:, None])
+        every_link = itertools.chain.from_iterable(route.links for route in routes)
+        self._t.hops[at[row], column] = np.fromiter(every_link, np.int32, len(row))
+        self._keys[at] = names
+        for slot, pair in zip(slots, pairs, strict=True):
             self._owners[slot] = listener
             self._pairs[slot] = pair
         self._started += count
         self.sent_bytes += float(sizes.sum())
-        joins = (sizes > 0.0) & ((lengths > 0) | np.isfinite(stories["cap"])) | (rows["finish"] >= _HORIZON)
+        self.sent_link_bytes += float(sizes @ lengths)
+        joins = (sizes > 0.0) & ((lengths > 0) | (limits < math.inf)) | (flows["finish"] >= _HORIZON)
         if not joins.all():
-            fluid.add_alone(self._t, at[~joins])
+            self._arm(fluid.add_alone(self._t, at[~joins]))
         if joins.any():
             ticks, which = np.unique(ends[joins], return_inverse=True)
             order = np.argsort(which, kind="stable")
@@ -450,7 +478,6 @@ class Network:
                 ticks.tolist(), np.split(at[joins][order], np.cumsum(np.bincount(which))[:-1]), strict=True
             ):
                 self._settle_at(tick).extend(group.tolist())
-        self._arm()
 
     # -- links that slow down or fail -----------------------------------------------------------------------------
 
@@ -467,7 +494,7 @@ class Network:
         share : float
             From 0, a failure, to 1.
         start, end : int
-            Ticks; without an end it stays so.
+            Ticks; without an end it stays so. What arrives at the start is through.
 
         Raises
         ------
@@ -480,6 +507,7 @@ class Network:
         if link not in self._index:
             raise UsageError(f"there is no link {link!r}{_near(link, self._index)}")
         now = cast("int", self._env.now)
+        start, end = operator.index(start), None if end is None else operator.index(end)
         if not 0.0 <= share <= 1.0:
             raise ScheduleError(f"a link's share of its bandwidth must lie between 0 and 1, got {share!r}")
         if not now <= start < (math.inf if end is None else end):
@@ -501,13 +529,16 @@ class Network:
 
     def _recapacitate(self, link: int) -> None:
         """Give a link the bandwidth it now has; have its flows rated anew, or fail."""
+        tick = cast("int", self._env.now)
+        if self._armed == tick:
+            self._let_go(tick)
         name, nominal = list(self._nominal.items())[link]
         share = min(self._disturbed[link], default=1.0)
         users, entry = [], int(self._t.links[link]["first"])
         while entry != NONE:
             users.append(entry // self._t.hops.shape[1])
             entry = int(self._t.after[entry])
-        slots = np.array(sorted(users, key=lambda slot: int(self._t.story[slot]["number"])), np.int32)
+        slots = self._in_order(np.array(users, np.int32))
         if share > 0.0:
             self._down.pop(link, None)
             self._t.links[link]["capacity"] = share * nominal.bandwidth
@@ -517,12 +548,11 @@ class Network:
             fluid.evict(self._t, slots, self._now())
             for slot in slots.tolist():
                 self._fail(slot)
-        self._settle_at(cast("int", self._env.now))
+        self._settle_at(tick)
 
     def _fail(self, slot: int) -> None:
         source, target = self._pairs[slot]
-        links = self._route(source, target).links.tolist()
-        name = next(self._down[link] for link in links if link in self._down)
+        name = next(self._down[link] for link in self._route(source, target).links if link in self._down)
         now = cast("int", self._env.now)
         error = LinkFailedError(
             f"the link {name} is down at {to_seconds(now):.9g} s, with {self._t.story[slot]['nbytes']:.0f} B "
@@ -536,7 +566,7 @@ class Network:
         owner.fail(error)
 
     def _meets_failure(self, slot: int) -> bool:
-        return any(link in self._down for link in self._route(*self._pairs[slot]).links.tolist())
+        return any(link in self._down for link in self._route(*self._pairs[slot]).links)
 
     # -- the course of events -------------------------------------------------------------------------------------
 
@@ -552,24 +582,22 @@ class Network:
         """Re-rate each component of flows in which something has started or ended at this tick."""
         arrivals = self._arrivals.pop(cast("int", self._env.now))
         if self._down:
-            for slot in [slot for slot in arrivals if self._meets_failure(slot)]:
-                arrivals.remove(slot)
-                self._fail(slot)
-        self._rate(arrivals, self._now())
-        self._arm()
+            through = []
+            for slot in arrivals:
+                if self._meets_failure(slot):
+                    self._fail(slot)
+                else:
+                    through.append(slot)
+            arrivals = through
+        now = self._now()
+        self._lengthen_log()
+        self._arm(fluid.settle(self._t, np.array(arrivals, np.int32), now))
 
-    def _rate(self, arrivals: list[int], now: int) -> None:
-        if len(self._t.log) and self._t.counters[LOGGED] + 2 * len(self._t.links) > len(self._t.log):
-            fluid.forget(self._t)
-            self._t = self._t.grown(len(self._t.flows), self._t.hops.shape[1], 2 * len(self._t.log))
-        fluid.settle(self._t, np.array(arrivals, np.int32), now)
-
-    def _arm(self) -> None:
-        """Make sure that the network wakes up when the next flow arrives."""
-        if self._t.counters[HEAP_SIZE] == 0:
+    def _arm(self, first: int) -> None:
+        """Make sure that the network wakes up when the first of the flows arrives."""
+        if first == NONE:
             return
-        key = int(self._t.heap[0]["tick"])
-        tick = self._epoch + key if key < FAR else min(self._far_ticks().values())
+        tick = self._epoch + first if first < FAR else min(self._far_ticks().values())
         if tick < self._armed:
             self._armed = tick
             _Alarm(self._env, tick, NORMAL, self._wake)
@@ -577,20 +605,17 @@ class Network:
     def _wake(self, _: simpy.Event) -> None:
         """Let go of the flows that arrive at this tick."""
         tick = cast("int", self._env.now)
-        if tick != self._armed:
-            return  # an earlier one was armed since, and has done the work of both
+        if tick == self._armed:  # else an earlier one was armed since, and has done the work of both
+            self._let_go(tick)
+
+    def _let_go(self, tick: int) -> None:
         self._armed = math.inf
         now = self._now()
-        count = fluid.release(self._t, now)
-        slots = self._t.arrived[:count]
-        if count > 1:
-            told = self._t.story[slots]
-            slots = slots[np.lexsort((told["number"], told["start"]))]
-        if vacated := int(self._t.counters[VACATED]):
-            if self._t.links["users"][self._t.vacated[:vacated]].any():
-                self._settle_at(tick)
-            else:
-                self._rate([], now)
+        self._lengthen_log()
+        count, first, unsettled = fluid.release(self._t, now)
+        slots = self._in_order(self._t.arrived[:count])
+        if unsettled:
+            self._settle_at(tick)
         batches: dict[Listener, list[int]] = {}
         for slot in slots.tolist():
             owner = self._owners[slot]
@@ -604,9 +629,18 @@ class Network:
             else:
                 batches.setdefault(owner, []).append(slot)
             self._free.append(slot)
-        for listener, theirs in batches.items():
-            listener(self._keys[theirs], tick)
-        self._arm()
+        # A listener may send more, into these slots.
+        for listener, keys in [(listener, self._keys[theirs]) for listener, theirs in batches.items()]:
+            listener(keys, tick)
+        self._arm(first)
+
+    def _in_order(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return the flows in the order in which they started."""
+        if len(slots) < 2:
+            return slots
+        told = self._t.story[slots]
+        ordered: NDArray[np.int32] = slots[np.lexsort((told["number"], told["start"]))]
+        return ordered
 
     # -- ticks beyond the horizon of the kernels ------------------------------------------------------------------
 
@@ -622,12 +656,13 @@ class Network:
         elapsed = np.array([(now - since) / TICKS_PER_SECOND for since in flows["since"].tolist()])
         self._t.flows["remaining"][used] = np.maximum(0.0, flows["remaining"] - flows["rate"] * elapsed)
         self._t.flows["since"][used] = 0
-        self._t.story["start"][used] = [max(-FAR, start - now) for start in starts]
+        self._t.story["start"][used] = [start if start == FAR else max(-FAR, start - now) for start in starts]
         left = [
             far[slot] - self._epoch - now if slot in far else tick - now
             for slot, tick in zip(used.tolist(), flows["finish"].tolist(), strict=True)
         ]
-        self._t.flows["finish"][used] = [tick if tick < _HORIZON else FAR for tick in left]
+        # Below zero is what has yet to begin, which has no finish, and what rounding put before the tick it is now.
+        self._t.flows["finish"][used] = [max(0, tick) if tick < _HORIZON else FAR for tick in left]
         for i in range(int(self._t.counters[HEAP_SIZE])):
             member, tick = int(self._t.heap[i]["leader"]), FAR
             while member != NONE:
@@ -668,8 +703,12 @@ class Network:
         """Make room for longer routes."""
         fluid.forget(self._t)
         self._t = self._t.grown(len(self._t.flows), 2 * hops, len(self._t.log))
-        for route in self._routes.values():
-            route.pad(2 * hops)
+
+    def _lengthen_log(self) -> None:
+        """Make room for what one settling of the network may log."""
+        if len(self._t.log) and self._t.counters[LOGGED] + 2 * len(self._t.links) > len(self._t.log):
+            fluid.forget(self._t)
+            self._t = self._t.grown(len(self._t.flows), self._t.hops.shape[1], 2 * len(self._t.log))
 
     def _check_route(self, source: Hashable, target: Hashable, names: Sequence[Hashable]) -> None:
         for i, name in enumerate(names):
@@ -687,31 +726,57 @@ class Network:
             if names is None:
                 raise UnreachableError(f"no route {source!r} -> {target!r}{self._alternatives(source, target)}")
             try:
-                links = np.array([self._index[name] for name in names], np.int32)
+                links = tuple([self._index[name] for name in names])
             except KeyError:
                 self._check_route(source, target, names)
                 raise
-            if len(set(names)) < len(names):
+            if len(set(links)) < len(links):
                 self._check_route(source, target, names)
             used = [self._nominal[name] for name in names]
-            latency = to_ticks(math.fsum(link.latency for link in used))
+            latency = to_ticks(math.fsum([link.latency for link in used]))
             if len(links) > self._t.hops.shape[1]:
                 self._widen(len(links))
             if len(self._routes) >= _MOST_ROUTES:  # each pair of a thousand ranks, once each
                 self._routes.clear()
-            route = _Route(links, latency, min((link.bandwidth for link in used), default=math.inf))
-            route.pad(self._t.hops.shape[1])
+            route = _Route(links, latency, min([link.bandwidth for link in used], default=math.inf))
             self._routes[source, target] = route
         return route
 
     def _alternatives(self, source: Hashable, target: Hashable) -> str:
         for node in (source, target):
-            if node not in self._nodes:
+            if self._nodes and node not in self._nodes:
                 return f": there is no node {node!r}{_near(node, self._nodes)}"
         others = sorted(repr(node) for node in self._nodes if node != source and self._find(source, node) is not None)
+        if not self._nodes:
+            return ""
         if not others:
             return f"; {source!r} reaches no other node"
         return f"; {source!r} reaches {', '.join(others[:8])}{', ...' if len(others) > 8 else ''}"
+
+
+def _check(nbytes: float, start: int, cap: float, delay: int, now: int) -> None:
+    """Refuse numbers that no transfer can have."""
+    if not 0.0 <= nbytes < math.inf:
+        raise ScheduleError(f"a transfer's size must be finite and not negative, got {nbytes!r} B")
+    if start < now:
+        raise ScheduleError(f"a transfer cannot start at tick {start}, before now, tick {now}")
+    if not cap > 0.0:
+        raise ScheduleError(f"a transfer's cap must be above zero, got {cap!r} B/s")
+    if delay < 0:
+        raise ScheduleError(f"a transfer's delay must not be negative, got {delay!r} ticks")
+
+
+def _whole(ticks: ArrayLike) -> NDArray[np.int64]:
+    """Return ticks or keys as an array; a fraction is a mistake that a cast would hide."""
+    table = np.asarray(ticks)
+    if table.size and table.dtype.kind not in "iu":
+        raise ScheduleError(f"ticks and keys must be whole numbers below 2^63, got an array of {table.dtype}")
+    return table.astype(np.int64, copy=False)
+
+
+def _column(values: NDArray[Any], count: int) -> NDArray[Any]:
+    """Return an array as it is if it is that long; one number for each."""
+    return values if values.shape == (count,) else np.broadcast_to(values, count)
 
 
 def _near(name: Hashable, known: Iterable[Hashable]) -> str:

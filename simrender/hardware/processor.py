@@ -129,16 +129,19 @@ class HostCard(Card):
 
 
 class CopyEngine:
-    """A GPU's engine for copies, which run one after the other and beside the kernels."""
+    """A GPU's engine for copies, which run one after the other and beside the kernels.
+
+    Attributes
+    ----------
+    waiting : int
+        Copies submitted so far that are not done.
+
+    """
 
     def __init__(self, env: simpy.Environment) -> None:
         self._env = env
         self._last: simpy.Event | None = None
-
-    @property
-    def idle(self) -> bool:
-        """Whether all copies submitted so far are done."""
-        return self._last is None or self._last.processed
+        self.waiting = 0
 
     def submit(self, begin: Callable[[int], simpy.Event], not_before: int) -> simpy.Event:
         """Run a copy when the one before is done; return what happens when it has arrived.
@@ -151,11 +154,17 @@ class CopyEngine:
             The earliest tick.
 
         """
-        if self.idle:
+        if not self.waiting:
             self._last = begin(not_before)
         else:
             self._last = self._env.process(self._after(cast("simpy.Event", self._last), begin, not_before))
+        self.waiting += 1
+        assert self._last.callbacks is not None  # noqa: S101 - it lies in the future
+        self._last.callbacks.append(self._finish)
         return self._last
+
+    def _finish(self, _: simpy.Event) -> None:
+        self.waiting -= 1
 
     def _after(
         self, previous: simpy.Event, begin: Callable[[int], simpy.Event], not_before: int

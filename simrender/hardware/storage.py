@@ -106,19 +106,8 @@ def storage_links(card: StorageCard, nodes: int) -> dict[Hashable, Link]:
     return links
 
 
-class _LoaderCard(Protocol):
-    @property
-    def parse_bandwidth(self) -> float: ...
-    @property
-    def build_rate(self) -> float: ...
-
-
-class Loader(Protocol):
-    """What parses files and builds acceleration structures: a `simrender.hardware.processor.Processor`."""
-
-    @property
-    def card(self) -> _LoaderCard:
-        """Has a ``parse_bandwidth`` (B/s) and a ``build_rate`` (primitives/s)."""
+class Kernels(Protocol):
+    """What parses files or builds acceleration structures: a `simrender.hardware.processor.Processor`."""
 
     def run(self, seconds: float, not_before: int) -> tuple[int, int]:
         """Queue a kernel and return the ticks at which it begins and ends."""
@@ -132,8 +121,10 @@ class LoadTimes:
     ----------
     began, opened, read : int
         When the file began to be opened, was open, and had arrived in the host's memory.
-    parsing, parsed, built : int
-        When the processor had time to parse it, had parsed it, and had built the acceleration structure.
+    parsing, parsed : int
+        When the processor of the host had time to parse it, and had parsed it.
+    copied, building, built : int
+        When it was in the memory of what traces rays, which had time for it, and had built the acceleration structure.
 
     """
 
@@ -142,6 +133,8 @@ class LoadTimes:
     read: int
     parsing: int
     parsed: int
+    copied: int
+    building: int
     built: int
 
     @property
@@ -156,8 +149,8 @@ class LoadTimes:
 
     @property
     def wait_ticks(self) -> int:
-        """Waiting for a processor that was busy."""
-        return self.parsing - self.read
+        """Waiting for processors that were busy."""
+        return self.parsing - self.read + self.building - self.copied
 
     @property
     def parse_ticks(self) -> int:
@@ -165,9 +158,14 @@ class LoadTimes:
         return self.parsed - self.parsing
 
     @property
+    def copy_ticks(self) -> int:
+        """Copying it to the GPU."""
+        return self.copied - self.parsed
+
+    @property
     def build_ticks(self) -> int:
         """Building the acceleration structure."""
-        return self.built - self.parsed
+        return self.built - self.building
 
 
 class Storage:
@@ -259,17 +257,19 @@ class Storage:
         node: int,
         nbytes: float,
         primitives: float,
-        processor: Loader,
+        parser: tuple[Kernels, float],
+        builder: tuple[Kernels, float],
         *,
+        device: Hashable | None = None,
         where: Where = "shared",
         stripe_count: int | None = None,
         start: int | None = None,
     ) -> Generator[simpy.Event, Any, LoadTimes]:
         """Read a domain, parse it, and build its acceleration structure, which out-of-core rendering does at each miss.
 
-        The processor parses and builds one after the other, once the last byte has arrived and it has nothing else to
-        do; SpRay, section 5.1, builds when a domain comes into the domain cache. To be used with ``yield from``, or as
-        a process that loads ahead.
+        The phases follow each other once the last byte has arrived, each when its processor has nothing else to do;
+        SpRay, section 5.1, builds when a domain comes into the domain cache. To be used with ``yield from``, or as a
+        process that loads ahead.
 
         Parameters
         ----------
@@ -278,7 +278,12 @@ class Storage:
             Size of the domain's file.
         primitives : float
             Triangles that go into the acceleration structure.
-        processor : Loader
+        parser : (Processor, float)
+            What parses, at how many B/s.
+        builder : (Processor, float)
+            What builds the acceleration structure, at how many primitives a second.
+        device : hashable, optional
+            The GPU that the data are copied to before it builds; they stay with the host unless given.
         where, stripe_count, start
             As for `read`.
 
@@ -298,10 +303,13 @@ class Storage:
         began = self._begin(start)
         arrival = self.read(node, nbytes, where=where, stripe_count=stripe_count, start=start)
         read = cast("int", (yield arrival))
-        parsing, parsed = processor.run(nbytes / processor.card.parse_bandwidth, read)
-        _, built = processor.run(primitives / processor.card.build_rate, parsed)
-        yield self._env.timeout(built - read)
-        return LoadTimes(began, began + self._open_ticks(where), read, parsing, parsed, built)
+        parsing, parsed = parser[0].run(nbytes / parser[1], read)
+        copied = parsed
+        if device is not None:
+            copied = cast("int", (yield self._network.transfer(("host", node), device, nbytes, start=parsed)))
+        building, built = builder[0].run(primitives / builder[1], copied)
+        yield self._env.timeout(built - int(self._env.now))
+        return LoadTimes(began, began + self._open_ticks(where), read, parsing, parsed, copied, building, built)
 
     def _begin(self, start: int | None) -> int:
         now = cast("int", self._env.now)

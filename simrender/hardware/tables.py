@@ -26,7 +26,8 @@ FLOW: Final = np.dtype(
         ("remaining", "f8"),  # how many bytes were left then
         ("rate", "f8"),
         ("weight", "i8"),  # in WEIGHT_UNITs
-        ("hops", "i4"),
+        ("hops", "i2"),
+        ("apart", "i2"),  # of a leader: whether its component may have come apart since all of it was searched
         ("mark", "i4"),  # the last search that found it
         ("position", "i4"),  # in the order in which its component was frozen
         ("next", "i4"),  # flow of its component

@@ -171,7 +171,7 @@ class Topology:
     """The links of a machine by name, and the routes over them.
 
     Names say where a link is: ``node2.gpu1.out``, ``node2.switch0.up``, ``node2.nic.out``, ``leaf0.up``; a machine of
-    one node leaves ``node0.`` away.
+    one node leaves ``node0.`` away, but for its disk and its share of the file system.
 
     Parameters
     ----------
@@ -262,6 +262,16 @@ class Topology:
 
     # -- routes ---------------------------------------------------------------------------------------------------
 
+    def fabric(self, source: int, target: int) -> FabricCard | None:
+        """Return what two GPUs of one node reach each other over; None where the card does not say."""
+        nvlink: NvlinkCard | None = self.card.nvlink
+        pcie: PcieCard | None = self.card.pcie
+        if nvlink and nvlink.pairs is not None:
+            (node, gpu), (other, other_gpu) = (divmod(i, self.card.node_processors) for i in (source, target))
+            pair = _group_of(nvlink.pairs, gpu)
+            return nvlink if node == other and pair is not None and pair == _group_of(nvlink.pairs, other_gpu) else pcie
+        return nvlink or pcie
+
     def route(self, source: Hashable, target: Hashable) -> tuple[str, ...] | None:
         """Return the links from one device to another, or None where there is no way."""
         if source == target:
@@ -332,7 +342,8 @@ class Topology:
             return (nic,)
         if not self.card.network.gpu_direct:
             return (*self._copy(node, gpu, out=True), *self._staging(p), nic)
-        return (*self._up(node, gpu), *self._across(node, self._socket(gpu), self.card.network.socket), nic)
+        across = self._across(node, self._socket(gpu), self.card.network.socket)
+        return (*(self._up(node, gpu) or self._copy(node, gpu, out=True)), *across, nic)
 
     def _from_nic(self, node: int, gpu: int | None) -> tuple[str, ...]:
         p, nic = self.prefix(node), f"{self.prefix(node)}nic.in"
@@ -340,7 +351,8 @@ class Topology:
             return (nic,)
         if not self.card.network.gpu_direct:
             return (nic, *self._staging(p), *self._copy(node, gpu, out=False))
-        return (nic, *self._across(node, self.card.network.socket, self._socket(gpu)), *self._down(node, gpu))
+        across = self._across(node, self.card.network.socket, self._socket(gpu))
+        return (nic, *across, *(self._down(node, gpu) or self._copy(node, gpu, out=False)))
 
     def _staging(self, p: str) -> tuple[str, ...]:
         return (f"{p}staging",) if f"{p}staging" in self.links else ()
@@ -369,10 +381,14 @@ class Topology:
         """Return the links of a copy between a GPU and the memory of the host."""
         if gpu is None:
             return ()
-        name = f"{self.prefix(node)}gpu{gpu}.{'d2h' if out else 'h2d'}"
+        name = f"{self.prefix(node)}gpu{gpu}"
+        own, lane = (f"{name}.d2h", f"{name}.out") if out else (f"{name}.h2d", f"{name}.in")
         way = self._up(node, gpu) if out else self._down(node, gpu)
-        own = (name,) if name in self.links else ()
-        return (*way, *own) if out else (*own, *way)
+        if own not in self.links:
+            return way
+        # What a copy to or from the host gets is known by itself; it shares the port with what goes between GPUs.
+        way = tuple(link for link in way if link != lane)
+        return (*way, own) if out else (own, *way)
 
     def _up(self, node: int, gpu: int) -> tuple[str, ...]:
         """Return the links from a GPU to the root complex of its socket."""

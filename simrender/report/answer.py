@@ -35,6 +35,8 @@ def answer(result: Result) -> RenderableType:
     table.add_row("islands", _islands(result))
     table.add_row("memory", _memory(result))
     table.add_row("where the time went", _bar(result.breakdown))
+    if result.busiest_link:
+        table.add_row("busiest link", _busiest(result, result.busiest_link))
     table.add_row("rays", _rays(result))
     table.add_row("left out", Text("; ".join(item["what"] for item in result.scope["left_out"]), style="dim"))
     title = Text(f"{result.workload} on {result.machine} under {result.policy}", style="bold underline")
@@ -48,7 +50,11 @@ def _sampling(result: Result, sign: int) -> str:
         return " (every pixel was traced)"
     either, slow = 100 * error["rays_relative_standard_error"], 100 * error["relative_error"]
     less, more = (either, slow) if sign > 0 else (slow, either)
-    return f" (-{less:.1g} % to +{more:.1g} %, sampling)"
+    return f" (-{_one_digit(less)} % to +{_one_digit(more)} %, sampling)"
+
+
+def _one_digit(value: float) -> str:
+    return f"{float(f'{value:.1g}'):g}"  # 10, and not 1e+01
 
 
 def _calibration(result: Result) -> Text:
@@ -83,6 +89,12 @@ def _bar(breakdown: dict[str, float]) -> Text:
         text.append(glyph * cells, style=color)
     words = ", ".join(f"{_BARS[name][0]} {name} {share:.0%}" for name, share in breakdown.items())
     return text.append(f"\n{words}", style="default")
+
+
+def _busiest(result: Result, name: str) -> str:
+    link = result.links[name]
+    mean, peak = (100.0 * link[f"{which}_utilization"] for which in ("mean", "peak"))
+    return f"{name}, {mean:.2g} % of its bandwidth over the frame, {peak:.3g} % at its peak"
 
 
 def _rays(result: Result) -> str:

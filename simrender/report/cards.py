@@ -29,8 +29,12 @@ _STYLES: Final = {
 _NARROW: Final = 110
 """Columns of a terminal below which a range stands under its value, so that the source keeps room to be read."""
 
-_VALUE: Final = 26
-"""Columns that a value gets at least, if it needs them."""
+_VALUE: Final = (40, 26)
+_STATUS: Final = (30, 12)
+"""Columns that a value and its status get at most; the second number is for a narrow terminal."""
+
+_SOURCE: Final = 12
+"""Columns that a source gets at least."""
 
 
 def titles(card: CardFile) -> list[tuple[str, str]]:
@@ -72,7 +76,7 @@ def describe_card(card: CardFile, width: int) -> RenderableType:
     if kind is None:
         raise CardError([f"{document.where}:1:1: expected the card of a machine or a workload, got neither's fields"])
     document.validate(_model(kind))
-    return Group(*_heading(card, document), _table(document, narrow=width < _NARROW))
+    return Group(*_heading(card, document), _table(document, width))
 
 
 def _model(kind: Kind) -> type[Card]:
@@ -97,34 +101,53 @@ def _heading(card: CardFile, document: Document) -> Iterator[RenderableType]:
     yield Text()
 
 
-def _table(document: Document, *, narrow: bool) -> Table:
+def _table(document: Document, width: int) -> Table:
     leaves = [(path, value) for path, value in _leaves(document.data, ()) if path != ("title",)]
     leaves.sort(key=lambda leaf: len(leaf[0]) > 1)  # what stands in no section comes first
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), header_style="dim underline")
+    narrow = width < _NARROW
     values = [_value(value, "\n{}" if narrow else " ({})") for _, value in leaves]
-    longest = max((len(line) for value in values for line in value.plain.splitlines()), default=0)
+    statuses = [_status(value, document, path, "\n" if narrow else ", ") for path, value in leaves]
+    names = [_name(path) for path, _ in leaves]
+    taken = [
+        max(map(len, ["field", *names])),
+        min(max(len("value"), _longest(values)), _VALUE[narrow]),
+        min(max(len("status"), _longest(statuses)), _STATUS[narrow]),
+    ]
     table.add_column("field", no_wrap=True)
-    table.add_column("value", overflow="fold", min_width=min(longest, _VALUE))
-    table.add_column("status", overflow="fold")
-    table.add_column("source", overflow="fold", style="dim")
+    table.add_column("value", overflow="fold", width=taken[1])
+    table.add_column("status", overflow="fold", width=taken[2])
+    # Rich cuts off what a minimum of another column leaves no room for, so the rest is worked out here.
+    table.add_column("source", overflow="fold", style="dim", width=max(width - sum(taken) - 6, _SOURCE))
     section = None
-    for (path, value), shown in zip(leaves, values, strict=True):
+    for (path, value), name, shown, status in zip(leaves, names, values, statuses, strict=True):
         if len(path) > 1 and path[0] != section:
             section = path[0]
             table.add_row()
             table.add_row(Text(str(section), style="bold"))
-        name = ".".join(str(part) for part in path[1:] or path)
         source = str(value.get("source", "")) if isinstance(value, dict) else ""
-        status = _status(value, document, path, "\n" if narrow else ", ")
-        table.add_row(Text(f"  {name}" if len(path) > 1 else name), shown, status, Text(source))
+        table.add_row(Text(name), shown, status, Text(source))
     return table
+
+
+def _name(path: Path) -> str:
+    """Return what to call a value below the name of its section."""
+    name = ".".join(str(part) for part in path[1:] or path)
+    return f"  {name}" if len(path) > 1 else name
+
+
+def _longest(cells: list[Text]) -> int:
+    return max((len(line) for cell in cells for line in cell.plain.splitlines()), default=0)
 
 
 def _status(value: Any, document: Document, path: Path, between: str) -> Text:
     """Return the status of a value and, where another card says it, that card."""
     status = str(value.get("status", "stated")) if isinstance(value, dict) else ""
     text, origin = Text(status, style=_STYLES.get(status, "")), document.origin(path)
-    if origin != document.name:
+    card = document.name.rpartition(":")[0] or document.name
+    if origin == document.name != card:
+        text.append(f"{between if status else ''}variant", "not dim magenta")
+    elif origin not in {document.name, card}:
         text.append(f"{between if status else ''}from {origin}", "not dim magenta")
     return text
 

@@ -14,6 +14,8 @@ from simrender.errors import UsageError
 from simrender.files import write
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from simrender.result import Result
 
 
@@ -67,8 +69,17 @@ def write_timeline(path: Path, result: Result) -> None:
     else:
         from simrender.report.plots import plot_timeline
 
-        figure = plot_timeline(result)
-        write(path, lambda file: figure.savefig(file, format="png", dpi=150))
+        write_figure(path, plot_timeline(result))
+
+
+def write_figure(path: Path, figure: Figure) -> None:
+    """Write a matplotlib figure, in the format that the file's ending says; the same figure gives the same file."""
+    import matplotlib as mpl
+
+    kind = path.suffix.lower().removeprefix(".")
+    metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(kind)
+    with mpl.rc_context({"svg.hashsalt": "simrender"}):
+        write(path, lambda file: figure.savefig(file, format=kind, dpi=150, metadata=metadata))
 
 
 def _put(file: BinaryIO, text: str) -> None:

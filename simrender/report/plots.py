@@ -10,6 +10,7 @@ from simrender.clock import TICKS_PER_SECOND
 from simrender.timeline import COPIES, KERNELS
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
     from simrender.result import Result
@@ -25,6 +26,9 @@ COLORS = {
 }
 """Trace and cycle in light greens, shading in dark green, as in figure 7 of the ray queue cycling paper."""
 
+LINK = "#c26a00"
+"""The utilization of the busiest link."""
+
 LABELS = {
     "generate": "generate",
     "trace": "trace",
@@ -36,8 +40,16 @@ LABELS = {
 }
 
 
+def _plot_load(axes: Axes, result: Result, name: str, bottom: float) -> None:
+    """Draw a link's utilization over time into a row of its own, on which zero is at the bottom."""
+    ticks, loads = result.loads[name]
+    times = np.concatenate([[0], ticks, [round((result.frame_time_s or 0.0) * TICKS_PER_SECOND)]]) / TICKS_PER_SECOND
+    share = np.concatenate([[0.0], loads, loads[-1:]]) / result.links[name]["bandwidth_bytes_per_s"]
+    axes.fill_between(times * 1e3, bottom, bottom - 0.8 * share, step="post", color=LINK, linewidth=0)
+
+
 def plot_timeline(result: Result, figure: Figure | None = None) -> Figure:
-    """Draw who did what, when: a row a GPU, idle time in the background colour.
+    """Draw who did what, when: a row a GPU, idle time in the background colour; below, the load of the busiest link.
 
     The layout of figure 7 of the ray queue cycling paper. The figure belongs to no window system and can be made in
     any thread.
@@ -76,13 +88,19 @@ def plot_timeline(result: Result, figure: Figure | None = None) -> Figure:
             legend.append(Patch(facecolor=COLORS[name], label=f"{LABELS[name]} ({share:.1%})"))
     idle = result.breakdown.get("wait", 0.0)
     legend.append(Patch(facecolor="#f4f4ef", edgecolor="#bbbbbb", label=f"idle ({idle:.1%})"))
-    axes.set_yticks(range(log.gpus), [f"GPU {i}" for i in range(log.gpus)])
-    axes.set_ylim(log.gpus - 0.5, -0.5)
+    rows = [f"{result.processor} {i}" for i in range(log.gpus)]
+    if result.busiest_link:
+        _plot_load(axes, result, result.busiest_link, log.gpus + 0.4)
+        load = result.links[result.busiest_link]["mean_utilization"]
+        legend.append(Patch(facecolor=LINK, label=f"load of the busiest link ({load:.1%})"))
+        rows.append(result.busiest_link)
+    axes.set_yticks(range(len(rows)), rows)
+    axes.set_ylim(len(rows) - 0.4, -0.5)
     axes.set_xlim(0.0, (result.frame_time_s or 0.0) * 1e3)
     axes.set_xlabel("time in the frame [ms]")
     axes.tick_params(axis="y", length=0)
     axes.spines[["top", "right", "left"]].set_visible(False)
     islands = f"{result.islands} island{'s' if result.islands != 1 else ''} of {result.island_size}"
     axes.set_title(f"{result.workload} on {result.machine}, {result.policy}, {islands}", fontsize=10)
-    figure.legend(handles=legend, loc="outside lower center", ncols=min(6, len(legend)), frameon=False, fontsize=8)
+    figure.legend(handles=legend, loc="outside lower center", ncols=min(7, len(legend)), frameon=False, fontsize=8)
     return figure

@@ -1,7 +1,5 @@
 """The network: worked by hand, against exact arithmetic, and where it is hard."""
 
-import doctest
-import itertools
 import math
 import os
 import subprocess
@@ -16,26 +14,12 @@ from hypothesis import strategies as st
 
 from simrender.clock import TICKS_PER_SECOND, to_ticks
 from simrender.errors import ScheduleError, UnreachableError, UsageError
-from simrender.hardware import maxmin
 from simrender.hardware.maxmin import max_min_rates
 from simrender.hardware.network import Link, Network
-from tests.flows import finishes
+from tests.flows import finishes, one_link, sharing, steps, wide
 
 SECOND = TICKS_PER_SECOND
 check = settings(deadline=None, derandomize=True, max_examples=100)
-
-
-def one_link(bandwidth, latency=0.0):
-    return {"wire": Link(bandwidth, latency)}, {("a", "b"): ["wire"]}
-
-
-def steps(env):
-    """Run to the end; return how many events SimPy processed."""
-    for count in itertools.count():
-        if env.peek() == math.inf:
-            return count
-        env.step()
-    raise AssertionError
 
 
 # Worked by hand
@@ -90,72 +74,6 @@ def test_a_transfer_may_start_later_and_its_value_is_the_tick_it_arrives():
     done = net.transfer("a", "b", 10.0, start=5 * SECOND)
     assert env.run(until=done) == env.now == done.value == 7 * SECOND
     assert (net.sent_bytes, net.flows_finished) == (10.0, 1)
-
-
-def test_the_docstring_is_true():
-    assert doctest.testmod(maxmin).failed == 0
-
-
-# The rates
-
-
-@st.composite
-def sharing(draw, capacity):
-    """Return capacities, and for each flow the links it uses, none of them twice."""
-    capacities = draw(st.lists(capacity, min_size=1, max_size=7))
-    link = st.integers(0, len(capacities) - 1)
-    return capacities, draw(st.lists(st.lists(link, min_size=1, max_size=4, unique=True), min_size=1, max_size=9))
-
-
-wide = st.floats(-6, 6).map(lambda exponent: 10.0**exponent)
-
-
-@check
-@given(sharing(wide))
-def test_no_link_is_over_capacity_and_each_flow_has_a_bottleneck(case):
-    capacities, flow_links = case
-    rates = max_min_rates(capacities, flow_links)
-    users = [
-        [rate for rate, links in zip(rates, flow_links, strict=True) if i in links] for i in range(len(capacities))
-    ]
-    full = [math.isclose(math.fsum(u), c, rel_tol=1e-12) for u, c in zip(users, capacities, strict=True)]
-    assert all(math.fsum(u) <= c * (1 + 1e-12) for u, c in zip(users, capacities, strict=True))
-    for rate, links in zip(rates, flow_links, strict=True):
-        assert any(full[link] and rate >= max(users[link]) * (1 - 1e-12) for link in links)
-
-
-@check
-@given(sharing(wide), st.randoms(use_true_random=False))
-def test_the_order_of_flows_and_links_changes_no_bit(case, rng):
-    capacities, flow_links = case
-    flow_order = rng.sample(range(len(flow_links)), len(flow_links))
-    new_name = rng.sample(range(len(capacities)), len(capacities))
-    shuffled = [rng.sample([new_name[link] for link in flow_links[f]], len(flow_links[f])) for f in flow_order]
-    renamed = [capacities[new_name.index(i)] for i in range(len(capacities))]
-    rates = max_min_rates(capacities, flow_links)
-    assert max_min_rates(renamed, shuffled) == [rates[flow] for flow in flow_order]
-
-
-@check
-@given(sharing(wide), sharing(wide))
-def test_components_rated_together_or_apart_get_the_same_bits(one, two):
-    offset = len(one[0])
-    together = max_min_rates(one[0] + two[0], one[1] + [[link + offset for link in links] for links in two[1]])
-    assert together == max_min_rates(*one) + max_min_rates(*two)
-
-
-@check
-@given(sharing(wide))
-def test_rates_scale_with_capacities(case):
-    capacities, flow_links = case
-    assert max_min_rates([2 * c for c in capacities], flow_links) == [
-        2 * r for r in max_min_rates(capacities, flow_links)
-    ]
-
-
-def test_a_flow_without_links_is_not_held_back():
-    assert max_min_rates([1.0], [(), (0,)]) == [math.inf, 1.0]
-    assert max_min_rates([], []) == []
 
 
 # The whole network, against exact arithmetic

@@ -1,7 +1,5 @@
 """Storage: reads, loads and block fetches worked by hand, and fetches whose threads get in each other's way."""
 
-from types import SimpleNamespace
-
 import pytest
 import simpy
 from hypothesis import given, settings
@@ -54,7 +52,8 @@ def make(card, nodes=4):
             routes["storage", ("host", node)] = ["storage", f"node{node}.client"]
         if card.local:
             routes[("disk", node), ("host", node)] = [f"node{node}.disk"]
-    return env, Storage(env, Network(env, storage_links(card, nodes), routes), card)
+    routes[("host", 0), "gpu"] = ["bus"]
+    return env, Storage(env, Network(env, storage_links(card, nodes) | {"bus": Link(2.0 * GB)}, routes), card)
 
 
 def read_alone(card, nbytes, **options):
@@ -213,16 +212,20 @@ def test_reads_that_cannot_be(card, options, error, words):
 
 
 class Queue:
-    """A processor that parses 4 GB/s and builds from 10 million primitives a second."""
+    """A processor that does one thing after the other."""
 
     def __init__(self):
-        self.card = SimpleNamespace(parse_bandwidth=4 * GB, build_rate=1e7)
         self.free_at = 0
 
     def run(self, seconds, not_before):
         begin = max(self.free_at, not_before)
         self.free_at = begin + to_ticks(seconds)
         return begin, self.free_at
+
+
+def on(processor):
+    """It parses 4 GB/s and builds from 10 million primitives a second."""
+    return (processor, 4.0 * GB), (processor, 1e7)
 
 
 def phases(times):
@@ -234,16 +237,27 @@ def phases(times):
 
 def test_a_load_opens_reads_parses_and_builds():
     env, storage = make(shared())
-    times = env.run(env.process(storage.load(0, 8 * GB, 3e7, Queue())))
+    times = env.run(env.process(storage.load(0, 8 * GB, 3e7, *on(Queue()))))
     assert phases(times) == [0.5, 4.0, 0.0, 2.0, 3.0]
     assert times.built == env.now == 19 * SECOND // 2
+
+
+def test_a_gpu_builds_what_the_cores_of_the_host_have_parsed():
+    env, storage = make(shared())
+    cores, gpu = Queue(), Queue()
+    gpu.run(20.0, 0)
+    load = storage.load(0, 8 * GB, 3e7, (cores, 4.0 * GB), (gpu, 1e7), device="gpu")
+    times = env.run(env.process(load))
+    assert phases(times) == [0.5, 4.0, 9.5, 2.0, 3.0]
+    assert times.copy_ticks == 4 * SECOND
+    assert (cores.free_at, gpu.free_at) == (13 * SECOND // 2, 23 * SECOND)
 
 
 def test_a_load_ahead_waits_for_a_processor_that_traces():
     env, storage = make(both())
     processor = Queue()
     processor.run(10.0, 0)
-    load = env.process(storage.load(1, 8 * GB, 1e7, processor, where="local", start=2 * SECOND))
+    load = env.process(storage.load(1, 8 * GB, 1e7, *on(processor), where="local", start=2 * SECOND))
     times = env.run(load)
     assert times.began == 2 * SECOND
     assert phases(times) == [0.25, 4.0, 3.75, 2.0, 1.0]
@@ -253,14 +267,14 @@ def test_a_load_ahead_waits_for_a_processor_that_traces():
 def test_two_loads_share_the_network_and_then_queue_for_the_processor():
     env, storage = make(shared())
     processor = Queue()
-    loads = [env.process(storage.load(0, 4 * GB, 1e7, processor, stripe_count=8)) for _ in range(2)]
+    loads = [env.process(storage.load(0, 4 * GB, 1e7, *on(processor), stripe_count=8)) for _ in range(2)]
     env.run()
     assert [phases(load.value) for load in loads] == [[0.5, 2.0, 0.0, 1.0, 1.0], [0.5, 2.0, 2.0, 1.0, 1.0]]
 
 
 def test_a_domain_without_primitives_has_nothing_to_build():
     env, storage = make(shared())
-    assert phases(env.run(env.process(storage.load(0, 0.0, 0.0, Queue())))) == [0.5, 0.0, 0.0, 0.0, 0.0]
+    assert phases(env.run(env.process(storage.load(0, 0.0, 0.0, *on(Queue()))))) == [0.5, 0.0, 0.0, 0.0, 0.0]
 
 
 @check
@@ -269,8 +283,15 @@ def test_the_phases_of_a_load_add_up(nbytes, primitives, start, busy):
     env, storage = make(shared())
     processor = Queue()
     processor.run(busy, 0)
-    times = env.run(env.process(storage.load(0, nbytes, primitives, processor, start=start)))
-    ticks = (times.open_ticks, times.read_ticks, times.wait_ticks, times.parse_ticks, times.build_ticks)
+    times = env.run(env.process(storage.load(0, nbytes, primitives, *on(processor), start=start)))
+    ticks = (
+        times.open_ticks,
+        times.read_ticks,
+        times.wait_ticks,
+        times.parse_ticks,
+        times.copy_ticks,
+        times.build_ticks,
+    )
     assert min(ticks) >= 0
     assert start + sum(ticks) == times.built == env.now
 
@@ -278,7 +299,7 @@ def test_the_phases_of_a_load_add_up(nbytes, primitives, start, busy):
 def test_a_load_of_fewer_primitives_than_none_is_refused():
     env, storage = make(shared())
     with pytest.raises(ScheduleError, match=r"primitives must be finite and not negative, got -1\.0"):
-        env.run(env.process(storage.load(0, 1.0, -1.0, Queue())))
+        env.run(env.process(storage.load(0, 1.0, -1.0, *on(Queue()))))
 
 
 # Blocks

@@ -3,9 +3,10 @@
 from typing import NamedTuple
 
 import pytest
+import simpy
 
 from simrender.clock import TICKS_PER_SECOND, to_ticks
-from simrender.hardware.network import Link
+from simrender.hardware.network import Link, Network
 from tests.flows import finishes
 
 SECOND = TICKS_PER_SECOND
@@ -86,11 +87,24 @@ TWELVE_SPEEDS = Star(
 
 
 @pytest.mark.parametrize("star", [TWO_SPEEDS, TWELVE_SPEEDS], ids=["two speeds", "twelve speeds"])
-def test_it_agrees_with_simgrid(star):
+@pytest.mark.parametrize("together", [False, True], ids=["one by one", "in a batch"])
+def test_it_agrees_with_simgrid(star, together):
     hosts = range(len(star.up))
     links = {("up", i): Link(star.up[i], 1e-6) for i in hosts} | {("down", i): Link(star.down[i], 1e-6) for i in hosts}
     routes = {(i, j): [("up", i), ("down", j)] for i in hosts for j in hosts if i != j}
-    ticks, _ = finishes(links, routes, [(a, b, nbytes, to_ticks(start)) for a, b, nbytes, start, _ in star.flows])
+    sources, targets, sizes, starts, _ = zip(*star.flows, strict=True)
+    begins = [to_ticks(start) for start in starts]
+    if together:
+        arrived = {}
+        net = Network(simpy.Environment(), links, routes)
+        net.post(
+            sources, targets, sizes, begins, lambda keys, tick: arrived.update(dict.fromkeys(keys.tolist(), tick)),
+            range(len(sizes)),
+        )  # fmt: skip
+        net._env.run()
+        ticks = [arrived[i] for i in range(len(sizes))]
+    else:
+        ticks, _ = finishes(links, routes, zip(sources, targets, sizes, begins, strict=True))
     # Rounding up to a picosecond is all that tells them apart.
     assert all(
         abs(tick / SECOND - flow[-1]) < 5e-12 + 1e-14 * flow[-1] for tick, flow in zip(ticks, star.flows, strict=True)
