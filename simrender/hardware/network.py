@@ -12,7 +12,6 @@ import itertools
 import math
 import operator
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -20,82 +19,26 @@ import simpy
 from numpy.typing import ArrayLike, NDArray
 from simpy.events import NORMAL, EventPriority
 
-from simrender.clock import TICKS_PER_SECOND, to_seconds, to_ticks
-from simrender.errors import LinkFailedError, ScheduleError, UnreachableError, UsageError, did_you_mean
+from simrender.clock import to_seconds, to_ticks
+from simrender.errors import LinkFailedError, ScheduleError, UsageError
 from simrender.hardware import fluid
-from simrender.hardware.routing import FewestHops
-from simrender.hardware.tables import FAR, FLOW, HEAP_SIZE, LOGGED, NONE, RATED, STORY, WEIGHT_UNIT, Tables
+from simrender.hardware.checks import check_transfer, column, whole
+from simrender.hardware.horizon import HORIZON, far_ticks, rebase
+from simrender.hardware.routing import FewestHops, Link, Route, Routes, RouteTable, near
+from simrender.hardware.tables import FAR, FLOW, LOGGED, NONE, RATED, STORY, WEIGHT_UNIT, Tables
+from simrender.hardware.usage import LinkUse, by_link, changes, link_use
 
 if TYPE_CHECKING:
     import networkx
 
+__all__ = ["Link", "LinkUse", "Listener", "Network"]
+
 Listener = Callable[[NDArray[np.int64], int], None]
-Routes = Mapping[tuple[Hashable, Hashable], Sequence[Hashable]] | Callable[[Any, Any], Sequence[Hashable] | None]
 
 _FIRST = EventPriority(NORMAL - 1)
 _LAST = EventPriority(NORMAL + 1)  # after everything that SimPy itself schedules at the same tick
-_HORIZON = FAR // 2
-_MOST_ROUTES = 2**17
 _FEW = 8  # messages sent together, at which it is as fast to send them one by one
 _WEIGHTS = (1.0 / 1024.0, 1024.0)
-
-
-@dataclass(frozen=True, slots=True)
-class Link:
-    """One direction of a cable, or a whole bus: a bandwidth that all flows through it share.
-
-    Parameters
-    ----------
-    bandwidth : float
-        Bytes a second; finite and above zero.
-    latency : float
-        Seconds that the first byte takes; finite and not negative.
-
-    Raises
-    ------
-    ScheduleError
-        If the bandwidth or the latency is out of range.
-
-    """
-
-    bandwidth: float
-    latency: float = 0.0
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.bandwidth < math.inf:
-            raise ScheduleError(f"a link's bandwidth must be finite and above zero, got {self.bandwidth!r} B/s")
-        if not 0.0 <= self.latency < math.inf:
-            raise ScheduleError(f"a link's latency must be finite and not negative, got {self.latency!r} s")
-
-
-@dataclass(frozen=True, slots=True)
-class LinkUse:
-    """What a link has done so far.
-
-    Attributes
-    ----------
-    carried_bytes : float
-        Of the transfers that have arrived.
-    busy_s : float
-        How long at least one flow was on it.
-    mean_utilization, peak_utilization : float
-        Share of its bandwidth in use, over all time so far and at the highest moment.
-
-    """
-
-    carried_bytes: float
-    busy_s: float
-    mean_utilization: float
-    peak_utilization: float
-
-
-class _Route:
-    """The links from one node to another, by index; their latency in ticks; the bandwidth of a flow alone on them."""
-
-    __slots__ = ("bandwidth", "latency", "links")
-
-    def __init__(self, links: tuple[int, ...], latency: int, bandwidth: float) -> None:
-        self.links, self.latency, self.bandwidth = links, latency, bandwidth
 
 
 class _Alarm(simpy.Event):
@@ -157,24 +100,13 @@ class Network:
         self.sent_bytes = self.sent_link_bytes = 0.0
         self.flows_finished = 0
         self._env = env
-        self._nominal = dict(links)
-        self._index = {name: i for i, name in enumerate(self._nominal)}
-        self._nodes = list(nodes)
-        if isinstance(routes, Mapping):
-            for (source, target), names in routes.items():
-                self._check_route(source, target, names)
-            given = {pair: tuple(names) for pair, names in routes.items()}
-            self._nodes = list(dict.fromkeys([*self._nodes, *(node for pair in given for node in pair)]))
-            self._find: Callable[[Any, Any], Sequence[Hashable] | None] = lambda s, t: given.get((s, t))
-        else:
-            self._find = routes
-        self._routes: dict[tuple[Hashable, Hashable], _Route] = {}
+        self._table = RouteTable(links, routes, nodes)
         self._disturbed: dict[int, list[float]] = {}
         self._down: dict[int, Hashable] = {}
 
-        rows = 1024 + 2 * len(self._nominal) if record else 0
-        self._t = Tables.room(0, len(self._nominal), 4, rows)
-        self._t.links["capacity"] = [link.bandwidth for link in self._nominal.values()]
+        rows = 1024 + 2 * len(self._table.links) if record else 0
+        self._t = Tables.room(0, len(self._table.links), 4, rows)
+        self._t.links["capacity"] = [link.bandwidth for link in self._table.links.values()]
         self._epochs: list[tuple[int, int]] = []  # rows of the log before which an epoch ended
         self._owners: list[Any] = []
         self._pairs: list[tuple[Any, Any]] = []
@@ -235,43 +167,24 @@ class Network:
     def carried_bytes(self) -> dict[Hashable, float]:
         """Bytes that each link has carried, of the transfers that have arrived."""
         carried = self._t.links["carried"] + self._t.links["carried_low"]
-        return dict(zip(self._nominal, carried.tolist(), strict=True))
+        return dict(zip(self._table.links, carried.tolist(), strict=True))
 
     @property
     def use(self) -> dict[Hashable, LinkUse]:
         """Bytes, busy time, mean and peak utilization of each link, over all time so far."""
-        now = int(self._env.now)
-        table: dict[Hashable, LinkUse] = {}
-        rows = zip(self._nominal.items(), self._t.links, self.carried_bytes.values(), strict=True)
-        for (name, link), row, carried in rows:
-            busy = float(row["busy"]) + (now - self._epoch - int(row["busy_since"]) if row["users"] else 0)
-            mean = carried / (link.bandwidth * to_seconds(now)) if now else 0.0
-            table[name] = LinkUse(carried, busy / TICKS_PER_SECOND, mean, float(row["peak"]))
-        return table
+        return link_use(self._t, self._table.links, self.carried_bytes, self._epoch, int(self._env.now))
 
     @property
     def loads(self) -> list[tuple[int, Hashable, float]]:
         """Every change of a link's load: the tick, the link's name, and the sum of the rates through it in B/s."""
-        names = list(self._nominal)
-        ticks, links, loads = (column.tolist() for column in self._changes())
+        names = list(self._table.links)
+        ticks, links, loads = (column.tolist() for column in changes(self._t, self._epochs))
         return [(tick, names[link], load) for tick, link, load in zip(ticks, links, loads, strict=True)]
 
     @property
     def loads_by_link(self) -> dict[Hashable, tuple[NDArray[np.int64], NDArray[np.float64]]]:
         """The same for each link that ever had a load, as arrays: ticks, and B/s from then on."""
-        ticks, links, loads = self._changes()
-        order = np.argsort(links, kind="stable")
-        used, first = np.unique(links[order], return_index=True)
-        names = list(self._nominal)
-        parts = zip(used.tolist(), np.split(ticks[order], first[1:]), np.split(loads[order], first[1:]), strict=False)
-        return {names[link]: (when, load) for link, when, load in parts}
-
-    def _changes(self) -> tuple[NDArray[np.int64], NDArray[np.int32], NDArray[np.float64]]:
-        """Return the log of loads in three columns: ticks, links by index, B/s."""
-        log = self._t.log[: int(self._t.counters[LOGGED])]
-        rows, epochs = zip((0, 0), *self._epochs, strict=True)
-        begins = np.array(epochs, np.int64 if self._epoch < FAR else object)  # which then do not fit 64 bits
-        return log["tick"] + begins[np.searchsorted(rows, np.arange(len(log)), "right") - 1], log["link"], log["load"]
+        return by_link(changes(self._t, self._epochs), list(self._table.links))
 
     def latency_ticks(self, source: Hashable, target: Hashable) -> int:
         """Return the latency of the route between two nodes.
@@ -341,12 +254,12 @@ class Network:
 
         """
         pair = (source, target)
-        route = self._routes.get(pair) or self._route(source, target)
+        route = self._table.made.get(pair) or self._route(source, target)
         now = cast("int", self._env.now)
         start, delay = now if start is None else operator.index(start), operator.index(delay)
         if not _WEIGHTS[0] <= weight <= _WEIGHTS[1]:
             raise ScheduleError(f"a transfer's weight must lie between 1/1024 and 1024, got {weight!r}")
-        _check(nbytes, start, cap, delay, now)
+        check_transfer(nbytes, start, cap, delay, now)
         done = simpy.Event(self._env)
         self._send(done, 0, pair, route, float(nbytes), start, float(weight), float(cap), delay)
         return done
@@ -356,7 +269,7 @@ class Network:
         owner: simpy.Event | Listener,
         key: int,
         pair: tuple[Hashable, Hashable],
-        route: _Route,
+        route: Route,
         nbytes: float,
         start: int,
         weight: float,
@@ -376,7 +289,7 @@ class Network:
         self._started += 1
         self.sent_bytes += nbytes
         self.sent_link_bytes += nbytes * hops
-        if (nbytes and (hops or cap < math.inf)) or relative >= _HORIZON:
+        if (nbytes and (hops or cap < math.inf)) or relative >= HORIZON:
             self._settle_at(arrival).append(slot)
         else:
             self._arm(fluid.add_alone(t, np.array([slot], np.int32)))
@@ -419,26 +332,25 @@ class Network:
 
         """
         now = cast("int", self._env.now)
-        known, pairs = self._routes, list(zip(sources, targets, strict=True))
+        known, pairs = self._table.made, list(zip(sources, targets, strict=True))
         routes = [known.get(pair) or self._route(*pair) for pair in pairs]
         count = len(pairs)
-        sizes = _column(np.asarray(nbytes, np.float64), count)
-        begins, names = _column(_whole(starts), count), _column(_whole(keys), count)
-        limits = np.full(count, math.inf) if caps is None else _column(np.asarray(caps, np.float64), count)
-        waits = np.zeros(count, np.int64) if delays is None else _column(_whole(delays), count)
+        sizes = column(np.asarray(nbytes, np.float64), count)
+        begins, names = column(whole(starts), count), column(whole(keys), count)
+        limits = np.full(count, math.inf) if caps is None else column(np.asarray(caps, np.float64), count)
+        waits = np.zeros(count, np.int64) if delays is None else column(whole(delays), count)
         if count <= _FEW:
             numbers = list(zip(sizes.tolist(), begins.tolist(), limits.tolist(), waits.tolist(), strict=True))
-            for size, begin, limit, wait in numbers:
-                _check(size, begin, limit, wait, now)
-            for key, pair, route, (size, begin, limit, wait) in zip(
-                names.tolist(), pairs, routes, numbers, strict=True
-            ):
+            for each in numbers:
+                check_transfer(*each, now)
+            messages = zip(names.tolist(), pairs, routes, numbers, strict=True)
+            for key, pair, route, (size, begin, limit, wait) in messages:
                 self._send(listener, key, pair, route, size, begin, 1.0, limit, wait)
             return
         good = (sizes >= 0.0) & (sizes < math.inf) & (begins >= now) & (limits > 0.0) & (waits >= 0)
         if not good.all():
             bad = int(np.argmin(good))
-            _check(float(sizes[bad]), int(begins[bad]), float(limits[bad]), int(waits[bad]), now)
+            check_transfer(float(sizes[bad]), int(begins[bad]), float(limits[bad]), int(waits[bad]), now)
         ends = begins + waits + np.fromiter((route.latency for route in routes), np.int64, count)
         if (ends < begins).any():
             raise ScheduleError("messages sent together must arrive before tick 2^63")
@@ -458,9 +370,9 @@ class Network:
         flows["hops"] = np.where(sizes > 0.0, lengths, 0)
         flows["next"] = flows["leader"] = flows["place"] = NONE
         self._t.flows[at], self._t.story[at] = flows, stories
-        row, column = np.nonzero(np.arange(lengths.max()) < lengths[:, None])
+        row, hop = np.nonzero(np.arange(lengths.max()) < lengths[:, None])
         every_link = itertools.chain.from_iterable(route.links for route in routes)
-        self._t.hops[at[row], column] = np.fromiter(every_link, np.int32, len(row))
+        self._t.hops[at[row], hop] = np.fromiter(every_link, np.int32, len(row))
         self._keys[at] = names
         for slot, pair in zip(slots, pairs, strict=True):
             self._owners[slot] = listener
@@ -468,15 +380,14 @@ class Network:
         self._started += count
         self.sent_bytes += float(sizes.sum())
         self.sent_link_bytes += float(sizes @ lengths)
-        joins = (sizes > 0.0) & ((lengths > 0) | (limits < math.inf)) | (flows["finish"] >= _HORIZON)
+        joins = (sizes > 0.0) & ((lengths > 0) | (limits < math.inf)) | (flows["finish"] >= HORIZON)
         if not joins.all():
             self._arm(fluid.add_alone(self._t, at[~joins]))
         if joins.any():
             ticks, which = np.unique(ends[joins], return_inverse=True)
             order = np.argsort(which, kind="stable")
-            for tick, group in zip(
-                ticks.tolist(), np.split(at[joins][order], np.cumsum(np.bincount(which))[:-1]), strict=True
-            ):
+            groups = np.split(at[joins][order], np.cumsum(np.bincount(which))[:-1])
+            for tick, group in zip(ticks.tolist(), groups, strict=True):
                 self._settle_at(tick).extend(group.tolist())
 
     # -- links that slow down or fail -----------------------------------------------------------------------------
@@ -504,15 +415,15 @@ class Network:
             If a number is out of range.
 
         """
-        if link not in self._index:
-            raise UsageError(f"there is no link {link!r}{_near(link, self._index)}")
+        if link not in self._table.index:
+            raise UsageError(f"there is no link {link!r}{near(link, self._table.index)}")
         now = cast("int", self._env.now)
         start, end = operator.index(start), None if end is None else operator.index(end)
         if not 0.0 <= share <= 1.0:
             raise ScheduleError(f"a link's share of its bandwidth must lie between 0 and 1, got {share!r}")
         if not now <= start < (math.inf if end is None else end):
             raise ScheduleError(f"a disturbance of {link!r} must begin now or later and end after it has begun")
-        index = self._index[link]
+        index = self._table.index[link]
         shares = self._disturbed.setdefault(index, [])
 
         def begin(_: simpy.Event) -> None:
@@ -532,7 +443,7 @@ class Network:
         tick = cast("int", self._env.now)
         if self._armed == tick:
             self._let_go(tick)
-        name, nominal = list(self._nominal.items())[link]
+        name, nominal = list(self._table.links.items())[link]
         share = min(self._disturbed[link], default=1.0)
         users, entry = [], int(self._t.links[link]["first"])
         while entry != NONE:
@@ -597,7 +508,7 @@ class Network:
         """Make sure that the network wakes up when the first of the flows arrives."""
         if first == NONE:
             return
-        tick = self._epoch + first if first < FAR else min(self._far_ticks().values())
+        tick = self._epoch + first if first < FAR else self._first_far_tick()
         if tick < self._armed:
             self._armed = tick
             _Alarm(self._env, tick, NORMAL, self._wake)
@@ -647,46 +558,28 @@ class Network:
     def _now(self) -> int:
         """Return the tick it is, relative to the epoch, which moves when that would become too large."""
         now = cast("int", self._env.now) - self._epoch
-        if now < _HORIZON:
+        if now < HORIZON:
             return now
-        fluid.forget(self._t)
-        far = self._far_ticks()
         used = np.array([slot for slot, owner in enumerate(self._owners) if owner is not None], np.int64)
-        flows, starts = self._t.flows[used], self._t.story["start"][used].tolist()
-        elapsed = np.array([(now - since) / TICKS_PER_SECOND for since in flows["since"].tolist()])
-        self._t.flows["remaining"][used] = np.maximum(0.0, flows["remaining"] - flows["rate"] * elapsed)
-        self._t.flows["since"][used] = 0
-        self._t.story["start"][used] = [start if start == FAR else max(-FAR, start - now) for start in starts]
-        left = [
-            far[slot] - self._epoch - now if slot in far else tick - now
-            for slot, tick in zip(used.tolist(), flows["finish"].tolist(), strict=True)
-        ]
-        # Below zero is what has yet to begin, which has no finish, and what rounding put before the tick it is now.
-        self._t.flows["finish"][used] = [max(0, tick) if tick < _HORIZON else FAR for tick in left]
-        for i in range(int(self._t.counters[HEAP_SIZE])):
-            member, tick = int(self._t.heap[i]["leader"]), FAR
-            while member != NONE:
-                tick = min(tick, int(self._t.flows[member]["finish"]))
-                member = int(self._t.flows[member]["next"])
-            self._t.heap[i]["tick"] = tick
-        fluid.reheap(self._t)
-        since = self._t.links["busy_since"]
-        self._t.links["busy"] += np.where(self._t.links["users"] > 0, float(now) - since, 0.0)
-        self._t.links["busy_since"] = 0
+        rebase(self._t, used, now)
         self._epochs.append((int(self._t.counters[LOGGED]), self._epoch + now))
         self._epoch += now
         return 0
 
-    def _far_ticks(self) -> dict[int, int]:
-        """Return the slots of flows that arrive beyond the horizon, with their ticks."""
+    def _first_far_tick(self) -> int:
+        """Return the tick at which the first of the flows arrives, where that is beyond the horizon."""
         slots = [s for s in np.flatnonzero(self._t.flows["finish"] == FAR).tolist() if self._owners[s] is not None]
-        return {
-            slot: self._epoch + int(flow["since"]) + to_ticks(float(flow["remaining"] / flow["rate"]))
-            for slot, flow in zip(slots, self._t.flows[slots], strict=True)
-            if flow["rate"] > 0.0
-        }
+        return self._epoch + min(far_ticks(self._t, slots).values())
 
-    # -- routes and room ------------------------------------------------------------------------------------------
+    # -- room -----------------------------------------------------------------------------------------------------
+
+    def _route(self, source: Hashable, target: Hashable) -> Route:
+        """Return the route between two nodes, having made sure that there is room for so many links."""
+        route = self._table.made.get((source, target)) or self._table.make(source, target)
+        if len(route.links) > self._t.hops.shape[1]:
+            fluid.forget(self._t)
+            self._t = self._t.grown(len(self._t.flows), 2 * len(route.links), len(self._t.log))
+        return route
 
     def _grow(self, wanted: int) -> None:
         """Make room for more flows."""
@@ -699,85 +592,8 @@ class Network:
         self._pairs += [(None, None)] * (size - old)
         self._free += range(size - 1, old - 1, -1)
 
-    def _widen(self, hops: int) -> None:
-        """Make room for longer routes."""
-        fluid.forget(self._t)
-        self._t = self._t.grown(len(self._t.flows), 2 * hops, len(self._t.log))
-
     def _lengthen_log(self) -> None:
         """Make room for what one settling of the network may log."""
         if len(self._t.log) and self._t.counters[LOGGED] + 2 * len(self._t.links) > len(self._t.log):
             fluid.forget(self._t)
             self._t = self._t.grown(len(self._t.flows), self._t.hops.shape[1], 2 * len(self._t.log))
-
-    def _check_route(self, source: Hashable, target: Hashable, names: Sequence[Hashable]) -> None:
-        for i, name in enumerate(names):
-            if name not in self._index:
-                near = _near(name, self._index)
-                raise UsageError(f"the route {source!r} -> {target!r} names an unknown link {name!r}{near}")
-            if name in names[:i]:
-                raise UsageError(f"the route {source!r} -> {target!r} uses the link {name!r} twice")
-
-    def _route(self, source: Hashable, target: Hashable) -> _Route:
-        """Return the route between two nodes, made when first asked for."""
-        route = self._routes.get((source, target))
-        if route is None:
-            names = self._find(source, target)
-            if names is None:
-                raise UnreachableError(f"no route {source!r} -> {target!r}{self._alternatives(source, target)}")
-            try:
-                links = tuple([self._index[name] for name in names])
-            except KeyError:
-                self._check_route(source, target, names)
-                raise
-            if len(set(links)) < len(links):
-                self._check_route(source, target, names)
-            used = [self._nominal[name] for name in names]
-            latency = to_ticks(math.fsum([link.latency for link in used]))
-            if len(links) > self._t.hops.shape[1]:
-                self._widen(len(links))
-            if len(self._routes) >= _MOST_ROUTES:  # each pair of a thousand ranks, once each
-                self._routes.clear()
-            route = _Route(links, latency, min([link.bandwidth for link in used], default=math.inf))
-            self._routes[source, target] = route
-        return route
-
-    def _alternatives(self, source: Hashable, target: Hashable) -> str:
-        for node in (source, target):
-            if self._nodes and node not in self._nodes:
-                return f": there is no node {node!r}{_near(node, self._nodes)}"
-        others = sorted(repr(node) for node in self._nodes if node != source and self._find(source, node) is not None)
-        if not self._nodes:
-            return ""
-        if not others:
-            return f"; {source!r} reaches no other node"
-        return f"; {source!r} reaches {', '.join(others[:8])}{', ...' if len(others) > 8 else ''}"
-
-
-def _check(nbytes: float, start: int, cap: float, delay: int, now: int) -> None:
-    """Refuse numbers that no transfer can have."""
-    if not 0.0 <= nbytes < math.inf:
-        raise ScheduleError(f"a transfer's size must be finite and not negative, got {nbytes!r} B")
-    if start < now:
-        raise ScheduleError(f"a transfer cannot start at tick {start}, before now, tick {now}")
-    if not cap > 0.0:
-        raise ScheduleError(f"a transfer's cap must be above zero, got {cap!r} B/s")
-    if delay < 0:
-        raise ScheduleError(f"a transfer's delay must not be negative, got {delay!r} ticks")
-
-
-def _whole(ticks: ArrayLike) -> NDArray[np.int64]:
-    """Return ticks or keys as an array; a fraction is a mistake that a cast would hide."""
-    table = np.asarray(ticks)
-    if table.size and table.dtype.kind not in "iu":
-        raise ScheduleError(f"ticks and keys must be whole numbers below 2^63, got an array of {table.dtype}")
-    return table.astype(np.int64, copy=False)
-
-
-def _column(values: NDArray[Any], count: int) -> NDArray[Any]:
-    """Return an array as it is if it is that long; one number for each."""
-    return values if values.shape == (count,) else np.broadcast_to(values, count)
-
-
-def _near(name: Hashable, known: Iterable[Hashable]) -> str:
-    return did_you_mean(name, [other for other in known if isinstance(other, str)]) if isinstance(name, str) else ""

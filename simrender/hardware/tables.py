@@ -1,4 +1,8 @@
-"""Flows, links and components of a fluid network as flat arrays, which the kernels share."""
+"""Flows, links and components of a fluid network as flat arrays, which the kernels share.
+
+Numba keeps compiled kernels by the date of the file that they stand in: whoever changes this file or `maxmin.py` must
+touch `fluid.py`, too.
+"""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -68,7 +69,7 @@ def plot_timeline(result: Result, figure: Figure | None = None) -> Figure:
     log = result.spans
     if log is None:
         raise ValueError("an infeasible run has no timeline")
-    figure = figure or NewFigure(figsize=(10.0, 1.3 + 0.32 * log.gpus), layout="constrained")
+    figure = figure or NewFigure(figsize=(10.0, 1.5 + 0.32 * log.gpus), layout="constrained")
     axes = figure.subplots()
     axes.set_facecolor("#f4f4ef")
     device, kind = np.array(log.device), np.array(log.kind)
@@ -88,7 +89,7 @@ def plot_timeline(result: Result, figure: Figure | None = None) -> Figure:
             legend.append(Patch(facecolor=COLORS[name], label=f"{LABELS[name]} ({share:.1%})"))
     idle = result.breakdown.get("wait", 0.0)
     legend.append(Patch(facecolor="#f4f4ef", edgecolor="#bbbbbb", label=f"idle ({idle:.1%})"))
-    rows = [f"{result.processor} {i}" for i in range(log.gpus)]
+    rows = [re.sub(r"^gpu(?=\d)", "GPU ", name) for name in log.names]
     if result.busiest_link:
         _plot_load(axes, result, result.busiest_link, log.gpus + 0.4)
         load = result.links[result.busiest_link]["mean_utilization"]
@@ -102,5 +103,5 @@ def plot_timeline(result: Result, figure: Figure | None = None) -> Figure:
     axes.spines[["top", "right", "left"]].set_visible(False)
     islands = f"{result.islands} island{'s' if result.islands != 1 else ''} of {result.island_size}"
     axes.set_title(f"{result.workload} on {result.machine}, {result.policy}, {islands}", fontsize=10)
-    figure.legend(handles=legend, loc="outside lower center", ncols=min(7, len(legend)), frameon=False, fontsize=8)
+    figure.legend(handles=legend, loc="outside lower center", ncols=min(5, len(legend)), frameon=False, fontsize=8)
     return figure
