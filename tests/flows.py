@@ -60,11 +60,11 @@ def flows_of_links(net):
         slots, before, entry = [], NONE, int(row["first"])
         while entry != NONE:
             slot, hop = divmod(entry, width)
-            assert t.before[entry] == before
+            assert t.chain["before"][entry] == before
             assert hop < t.flows[slot]["hops"]
             assert t.hops[slot, hop] == link
             slots.append(slot)
-            before, entry = entry, int(t.after[entry])
+            before, entry = entry, int(t.chain["after"][entry])
         assert len(set(slots)) == len(slots) == row["users"]
         assert row["weight"] == sum(int(t.flows[slot]["weight"]) for slot in slots)
         users.append(slots)

@@ -29,6 +29,7 @@ from simrender.hardware.tables import (
     NONE,
     NOT_FROZEN,
     PULLED,
+    QUEUED,
     RATED,
     RESUMED,
     ROUNDS,
@@ -107,14 +108,15 @@ def _push(t: Tables, tick: int, leader: int) -> None:
 @kernel
 def _pull(t: Tables, leader: int) -> None:
     """Take a component out of the heap, wherever it is."""
-    place = t.flows[leader].place
+    place = int(np.int64(t.flows[leader].place))
     t.flows[leader].place = NONE
     t.counters[HEAP_SIZE] -= 1
     size = t.counters[HEAP_SIZE]
     if place < size:
-        _place(t, place, t.heap[size].tick, t.heap[size].leader)
+        last = t.heap[size].leader
+        _place(t, place, t.heap[size].tick, last)
         _sift_up(t, place)
-        _sift_down(t, t.flows[t.heap[size].leader].place, size)
+        _sift_down(t, int(np.int64(t.flows[last].place)), size)
 
 
 @kernel
@@ -139,9 +141,9 @@ def _join(t: Tables, f: int, now: int) -> None:
         link = t.hops[f, h]
         entry = f * t.hops.shape[1] + h
         first = t.links[link].first
-        t.after[entry], t.before[entry] = first, NONE
+        t.chain[entry].after, t.chain[entry].before = first, NONE
         if first != NONE:
-            t.before[first] = entry
+            t.chain[first].before = entry
         t.links[link].first = entry
         if t.links[link].users == 0:
             t.links[link].busy_since = now
@@ -155,19 +157,19 @@ def _leave(t: Tables, f: int, now: int) -> None:
     for h in range(t.flows[f].hops):
         link = t.hops[f, h]
         entry = f * t.hops.shape[1] + h
-        if t.before[entry] == NONE:
-            t.links[link].first = t.after[entry]
+        if t.chain[entry].before == NONE:
+            t.links[link].first = t.chain[entry].after
         else:
-            t.after[t.before[entry]] = t.after[entry]
-        if t.after[entry] != NONE:
-            t.before[t.after[entry]] = t.before[entry]
+            t.chain[t.chain[entry].before].after = t.chain[entry].after
+        if t.chain[entry].after != NONE:
+            t.chain[t.chain[entry].after].before = t.chain[entry].before
         t.links[link].users -= 1
         t.links[link].weight -= t.flows[f].weight
         if t.links[link].users == 0:
             t.links[link].busy += now - t.links[link].busy_since
         if t.links[link].vacated == 0:
             t.links[link].vacated = 1
-            t.vacated[t.counters[VACATED]] = link
+            t.roads[t.counters[VACATED]].vacated = link
             t.counters[VACATED] += 1
 
 
@@ -194,7 +196,7 @@ def release(t: Tables, now: int) -> tuple[int, int, bool]:
     Returns how many, their slots being in ``arrived``; the first tick at which another arrives; and whether others have
     to be rated anew for it.
     """
-    arrived, count = t.arrived, 0
+    notes, count = t.notes, 0
     while t.counters[HEAP_SIZE] > 0 and t.heap[0].tick <= now:
         member = t.heap[0].leader
         _pull(t, member)
@@ -202,29 +204,29 @@ def release(t: Tables, now: int) -> tuple[int, int, bool]:
         if member != t.counters[LAST] or t.flows[member].hops == 0:
             while member != NONE:
                 if t.flows[member].finish <= now:
-                    arrived[count] = member
+                    notes[count].arrived = member
                     count += 1
                 else:
                     _widow(t, member)
                 member = t.flows[member].next
         else:
             t.counters[PULLED] = 1
-            earliest = t.earliest[t.counters[LISTED] - 1]
-            if earliest.ties == 1:
-                arrived[count] = earliest.flow
+            last = t.frozen[t.counters[LISTED] - 1]
+            if last.ties == 1:
+                notes[count].arrived = last.earliest
                 count += 1
             else:
                 for i in range(t.counters[LISTED]):
-                    if t.order[i] != NONE and t.flows[t.order[i]].finish <= now:
-                        arrived[count] = t.order[i]
+                    if t.frozen[i].flow != NONE and t.flows[t.frozen[i].flow].finish <= now:
+                        notes[count].arrived = t.frozen[i].flow
                         count += 1
             for i in range(begin, count):  # strike them from what the last rating left
-                position = t.flows[arrived[i]].position
-                t.counters[CHANGED] = min(t.counters[CHANGED], t.round_of[position])
-                t.order[position] = NONE
-                t.fresh[arrived[i]] = 0.0
+                position = t.flows[notes[i].arrived].position
+                t.counters[CHANGED] = min(t.counters[CHANGED], t.frozen[position].round)
+                t.frozen[position].flow = NONE
+                t.fresh[notes[i].arrived] = 0.0
         for i in range(begin, count):
-            f = arrived[i]
+            f = notes[i].arrived
             _leave(t, f, now)
             nbytes = t.story[f].nbytes
             for h in range(t.flows[f].hops):
@@ -235,7 +237,7 @@ def release(t: Tables, now: int) -> tuple[int, int, bool]:
                 t.links[link].carried = total
     crowded = False
     for i in range(t.counters[VACATED]):
-        crowded |= t.links[t.vacated[i]].users > 0
+        crowded |= t.links[t.roads[i].vacated].users > 0
     if t.counters[PULLED] and not crowded:
         forget(t)  # either nobody is left, or the component had come apart
     unsettled = crowded or t.counters[WIDOWED] > 0
@@ -248,7 +250,7 @@ def release(t: Tables, now: int) -> tuple[int, int, bool]:
 def _widow(t: Tables, f: int) -> None:
     """Note a flow that has to be rated anew, since its component is out of the heap."""
     t.flows[f].leader = NONE  # that one may be gone, and its slot another's
-    t.widowed[t.counters[WIDOWED]] = f
+    t.notes[t.counters[WIDOWED]].widowed = f
     t.counters[WIDOWED] += 1
 
 
@@ -265,8 +267,8 @@ def forget(t: Tables) -> None:
     """Do not go on from the last rating, but start anew; what was pulled out of the heap has to be rated again."""
     if t.counters[PULLED]:
         for i in range(t.counters[LISTED]):
-            if t.order[i] != NONE:
-                _widow(t, t.order[i])
+            if t.frozen[i].flow != NONE:
+                _widow(t, t.frozen[i].flow)
     t.counters[PULLED], t.counters[LAST] = 0, NONE
 
 
@@ -289,8 +291,8 @@ def evict(t: Tables, slots: Array, now: int) -> None:
         _leave(t, f, now)
         t.flows[f].weight = 0
     for i in range(t.counters[WIDOWED]):
-        if t.widowed[i] != NONE and t.flows[t.widowed[i]].weight == 0:
-            t.widowed[i] = NONE
+        if t.notes[i].widowed != NONE and t.flows[t.notes[i].widowed].weight == 0:
+            t.notes[i].widowed = NONE
 
 
 # -- rating ----------------------------------------------------------------------------------------------------------
@@ -318,7 +320,7 @@ def settle(t: Tables, arrivals: Array, now: int) -> int:
                 _rate(t, f, now)
         i = 0
         while i < t.counters[WIDOWED]:  # which may grow meanwhile
-            f = t.widowed[i]
+            f = t.notes[i].widowed
             i += 1
             if f != NONE and t.flows[f].mark != t.counters[STAMP]:
                 _rate(t, f, now)
@@ -330,24 +332,25 @@ def settle(t: Tables, arrivals: Array, now: int) -> int:
 @kernel
 def _empty_vacated(t: Tables, now: int) -> None:
     for i in range(t.counters[VACATED]):
-        t.links[t.vacated[i]].vacated = 0
-        if t.links[t.vacated[i]].users == 0:
-            _set_load(t, t.vacated[i], 0.0, now)
+        t.links[t.roads[i].vacated].vacated = 0
+        if t.links[t.roads[i].vacated].users == 0:
+            _set_load(t, t.roads[i].vacated, 0.0, now)
     t.counters[VACATED] = 0
 
 
 @kernel
 def _rate(t: Tables, seed: int, now: int) -> None:
     """Find the component of a flow, give its flows their fair rates, and put it into the heap."""
-    n_flows, n_links = _component(t, seed)
-    if n_flows == 1:  # what `fill` would come to, to the bit
+    _component(t, seed)
+    n_links = t.counters[TOUCHED]
+    if t.counters[QUEUED] == 1:  # what `fill` would come to, to the bit
         weight = t.flows[seed].weight * WEIGHT_UNIT
         level = t.story[seed].cap / weight
         for i in range(n_links):
-            level = min(level, t.links[t.touched[i]].capacity / weight)
+            level = min(level, t.links[t.roads[i].touched].capacity / weight)
         rate = min(weight * level, t.story[seed].cap)
         for i in range(n_links):
-            link = t.touched[i]
+            link = t.roads[i].touched
             _set_load(t, link, _load(t.links[link].capacity, t.links[link].capacity - weight * level), now)
         t.flows[seed].leader, t.flows[seed].next, t.flows[seed].apart = seed, NONE, 0
         _change_rate(t, seed, rate, now)
@@ -356,12 +359,12 @@ def _rate(t: Tables, seed: int, now: int) -> None:
         _push(t, t.flows[seed].finish, seed)
         return
     for i in range(n_links):
-        link = t.touched[i]
+        link = t.roads[i].touched
         t.links[link].weighed = t.links[link].left = t.links[link].weight
         t.links[link].residual, t.links[link].floor = t.links[link].capacity, 0.0
-    t.counters[LISTED], t.counters[TOUCHED], t.counters[ROUNDS], t.counters[RESUMED] = 0, n_links, 0, 0
-    fill(t, t.queue[:n_flows])
-    _finish_rating(t, 0, now)
+    t.counters[LISTED], t.counters[ROUNDS], t.counters[RESUMED] = 0, 0, 0
+    fill(t)
+    _finish_rating(t, now)
 
 
 @kernel
@@ -372,55 +375,57 @@ def _rate_again(t: Tables, now: int) -> None:
     filling goes on from there: flows slower than all that left are not touched.
     """
     changed = t.counters[CHANGED]
-    first, undone = t.rounds[changed].listed, t.rounds[changed].undo
-    last_undo = t.rounds[t.counters[ROUNDS]].undo
+    first, undone = t.frozen[changed].before, t.frozen[changed].undo
+    last_undo = t.frozen[t.counters[ROUNDS]].undo
     for i in range(last_undo - 1, undone - 1, -1):
         row = t.undo[i]
         t.links[row.link].left += row.taken
         t.links[row.link].residual, t.links[row.link].floor = row.residual, row.floor
     for i in range(t.counters[TOUCHED]):
-        link = t.touched[i]
+        link = t.roads[i].touched
         t.links[link].left -= t.links[link].weighed - t.links[link].weight
         t.links[link].weighed = t.links[link].weight
-    count = 0
+    t.counters[QUEUED] = 0
     for i in range(first, t.counters[LISTED]):
-        f = t.order[i]
+        f = t.frozen[i].flow
         if f != NONE:
             t.fresh[f] = NOT_FROZEN
-            t.queue[count] = f
-            count += 1
+            t.notes[t.counters[QUEUED]].queue = f
+            t.counters[QUEUED] += 1
     t.counters[LISTED], t.counters[ROUNDS] = first, changed
     t.counters[RESUMED] += 1
-    fill(t, t.queue[:count])
-    _finish_rating(t, first, now)
+    fill(t)
+    _finish_rating(t, now)
 
 
 @kernel
-def _finish_rating(t: Tables, first: int, now: int) -> None:
-    """Apply the new rates of a component, of its flows from ``first`` on, and put it into the heap."""
+def _finish_rating(t: Tables, now: int) -> None:
+    """Apply the new rates of those flows of a component that were in the queue, and put it into the heap."""
+    first = t.counters[LISTED] - t.counters[QUEUED]
     for i in range(t.counters[TOUCHED]):
-        link = t.touched[i]
+        link = t.roads[i].touched
         _set_load(t, link, _load(t.links[link].capacity, t.links[link].residual), now)
-    order, earliest, listed = t.order, t.earliest, t.counters[LISTED]
+    frozen, listed = t.frozen, t.counters[LISTED]
     t.counters[LAST], t.counters[PULLED], t.counters[CHANGED] = NONE, 0, NO_ROUND
     if listed == 0:
         return
-    leader = order[0]
+    leader = frozen[0].flow
     if first:
-        t.flows[order[first - 1]].next = order[first] if first < listed else NONE
-        tick, flow, ties = earliest[first - 1].tick, earliest[first - 1].flow, earliest[first - 1].ties
+        last = frozen[first - 1]
+        t.flows[last.flow].next = frozen[first].flow if first < listed else NONE
+        tick, flow, ties = last.tick, last.earliest, last.ties
     else:
         tick, flow, ties = FAR, NONE, 0
     for i in range(first, listed):
-        f = order[i]
+        f = frozen[i].flow
         _change_rate(t, f, t.fresh[f], now)
         if t.flows[f].finish < tick:
             tick, flow, ties = t.flows[f].finish, f, 1
         elif t.flows[f].finish == tick:
             ties += 1
-        earliest[i].tick, earliest[i].flow, earliest[i].ties = tick, flow, ties
+        frozen[i].tick, frozen[i].earliest, frozen[i].ties = tick, flow, ties
         t.flows[f].leader, t.flows[f].position = leader, i
-        t.flows[f].next = order[i + 1] if i + 1 < listed else NONE
+        t.flows[f].next = frozen[i + 1].flow if i + 1 < listed else NONE
     t.counters[RATED] += listed - first
     t.counters[LAST] = leader
     t.flows[leader].apart = t.counters[RESUMED]
@@ -439,19 +444,19 @@ def _change_rate(t: Tables, f: int, rate: float, now: int) -> None:
 
 
 @kernel
-def _component(t: Tables, seed: int) -> tuple[int, int]:
-    """Collect the flows that share a link with this one, or with one that does, and so on, and their links.
+def _component(t: Tables, seed: int) -> None:
+    """Queue the flows that share a link with this one, or with one that does, and so on; and list their links.
 
     Each link's flows are written down one after the other in the roster, from the link's ``begin`` to its ``end``. What
     of them stood in the heap is taken out.
     """
-    queue, touched, roster = t.queue, t.touched, t.roster
+    roster = t.roster
     stamp, width = t.counters[STAMP], t.hops.shape[1]
     t.flows[seed].mark, t.fresh[seed] = stamp, NOT_FROZEN
-    queue[0] = seed
+    t.notes[0].queue = seed
     n_flows, n_links, n_entries, i = 1, 0, 0, 0
     while i < n_flows:
-        f = queue[i]
+        f = t.notes[i].queue
         i += 1
         leader = t.flows[f].leader
         if leader != NONE and t.flows[leader].place != NONE:
@@ -462,7 +467,7 @@ def _component(t: Tables, seed: int) -> tuple[int, int]:
             link = t.hops[f, h]
             if t.links[link].mark != stamp:
                 t.links[link].mark, t.links[link].begin = stamp, n_entries
-                touched[n_links] = link
+                t.roads[n_links].touched = link
                 n_links += 1
                 entry = t.links[link].first
                 while entry != NONE:
@@ -471,11 +476,11 @@ def _component(t: Tables, seed: int) -> tuple[int, int]:
                     n_entries += 1
                     if t.flows[other].mark != stamp:
                         t.flows[other].mark, t.fresh[other] = stamp, NOT_FROZEN
-                        queue[n_flows] = other
+                        t.notes[n_flows].queue = other
                         n_flows += 1
-                    entry = t.after[entry]
+                    entry = t.chain[entry].after
                 t.links[link].end = n_entries
-    return n_flows, n_links
+    t.counters[QUEUED], t.counters[TOUCHED] = n_flows, n_links
 
 
 @kernel

@@ -448,7 +448,7 @@ class Network:
         users, entry = [], int(self._t.links[link]["first"])
         while entry != NONE:
             users.append(entry // self._t.hops.shape[1])
-            entry = int(self._t.after[entry])
+            entry = int(self._t.chain["after"][entry])
         slots = self._in_order(np.array(users, np.int32))
         if share > 0.0:
             self._down.pop(link, None)
@@ -524,7 +524,7 @@ class Network:
         now = self._now()
         self._lengthen_log()
         count, first, unsettled = fluid.release(self._t, now)
-        slots = self._in_order(self._t.arrived[:count])
+        slots = self._in_order(self._t.notes["arrived"][:count])
         if unsettled:
             self._settle_at(tick)
         batches: dict[Listener, list[int]] = {}

@@ -72,17 +72,28 @@ LINK: Final = np.dtype(
     ]
 )
 HEAP: Final = np.dtype([("tick", "i8"), ("leader", "i4")])  # the earliest finish in a component
-HEAP_SIZE, STAMP, VACATED, RATED, LOGGED, WIDOWED, CAPPED, LAST, PULLED, LISTED, TOUCHED, ROUNDS, CHANGED, RESUMED = (
-    range(14)
-)
-COUNTERS: Final = 14
+HEAP_SIZE, STAMP, VACATED, RATED, LOGGED, WIDOWED, CAPPED, QUEUED = range(8)
+LAST, PULLED, LISTED, TOUCHED, ROUNDS, CHANGED, RESUMED = range(8, 15)
+COUNTERS: Final = 15
 """Of these LAST to RESUMED tell what the last rating left in the scratch arrays, for the next one to go on from: the
 leader of the component, whether that is out of the heap, its flows and links and rounds of filling, the first round
 that has changed since, and how many ratings in a row have gone on from it."""
 
-ROUND: Final = np.dtype([("listed", "i4"), ("undo", "i4")])  # flows and undo rows before a round
+CHAIN: Final = np.dtype([("after", "i4"), ("before", "i4")])
+ROAD: Final = np.dtype([("touched", "i4"), ("vacated", "i4")])
+NOTE: Final = np.dtype([("arrived", "i4"), ("widowed", "i4"), ("queue", "i4")])
+FROZEN: Final = np.dtype(
+    [
+        ("tick", "i8"),  # the earliest finish of the flows so far,
+        ("earliest", "i4"),  # whose it is,
+        ("ties", "i4"),  # and how many arrive then
+        ("flow", "i4"),
+        ("round", "i4"),
+        ("before", "i4"),  # how many flows were frozen before the round of this row's number,
+        ("undo", "i4"),  # and how many links it and earlier ones had touched
+    ]
+)
 UNDO: Final = np.dtype([("link", "i4"), ("taken", "i8"), ("residual", "f8"), ("floor", "f8")])
-EARLIEST: Final = np.dtype([("tick", "i8"), ("flow", "i4"), ("ties", "i4")])
 WORTH_RESUMING: Final = 64  # flows; searching a smaller component costs nothing
 MOST_RESUMES: Final = 16  # in a row: the component may have come apart
 LOG: Final = np.dtype([("tick", "i8"), ("link", "i4"), ("load", "f8")])
@@ -91,58 +102,50 @@ LOG: Final = np.dtype([("tick", "i8"), ("link", "i4"), ("load", "f8")])
 class Tables(NamedTuple):
     """Everything that the kernels work on: n flows in slots, m links, and routes of up to w links.
 
+    Lists that are as long as there are flows, or links, share an array: the fewer arrays, the less there is to compile.
+
     Attributes
     ----------
     flows, story : arrays of FLOW and STORY, (n,)
     hops : int32 array, (n, w)
         The links of each flow.
-    after, before : int32 arrays, (n x w,)
+    chain : array of CHAIN, (n x w,)
         The list of each link's flows: the entry ``slot x w + hop`` has these neighbours.
     links : array of LINK, (m,)
+    roads : array of ROAD, (m,)
+        Two lists of links: those of a component, and those that a flow has left at this tick.
     heap : array of HEAP, (n,)
         Components, the first to have an arrival on top.
-    vacated : int32 array, (m,)
-        Links that a flow has left at this tick.
     counters : int64 array
     log : array of LOG
         Changes of load; without room, nothing is logged.
-    arrived : int32 array, (n,)
-        Flows that have just been let go.
-    widowed : int32 array, (n,)
-        Flows that have to be rated anew since one of their component has left.
+    notes : array of NOTE, (n,)
+        Three lists of flows: those that have just been let go, those that have to be rated anew since one of their
+        component has left, and those of a component.
     fresh : float64 array, (n,)
         The rate that each flow is about to get.
-    queue, touched, roster : int32 arrays, (n,), (m,), (n x w,)
-        The flows of a component, its links, and the flows of one link after the other.
-    order, round_of : int32 arrays, (n,)
-        Its flows in the order in which they were frozen, and in which round each was.
-    earliest : array of EARLIEST, (n,)
-        Which of the flows so far in that order arrives first, and how many at the same tick.
-    rounds, undo : arrays of ROUND and UNDO, (n + 1,), (n x w,)
-        What was listed before each round, and what the links that it touched were before.
+    roster : int32 array, (n x w,)
+        The flows of one link of a component after the other.
+    frozen : array of FROZEN, (n + 1,)
+        The flows of a component in the order in which they were frozen; and the rounds.
+    undo : array of UNDO, (n x w,)
+        What the links that a round touched were before.
 
     """
 
     flows: Array
     story: Array
     hops: Array
-    after: Array
-    before: Array
+    chain: Array
     links: Array
+    roads: Array
     heap: Array
-    vacated: Array
     counters: Array
     log: Array
-    arrived: Array
-    widowed: Array
+    notes: Array
     fresh: Array
-    queue: Array
-    touched: Array
     roster: Array
-    order: Array
-    round_of: Array
-    earliest: Array
-    rounds: Array
+    frozen: Array
     undo: Array
 
     @classmethod
@@ -155,28 +158,24 @@ class Tables(NamedTuple):
         rows["place"] = NONE
         roads = np.zeros(links, LINK)
         roads["first"] = NONE
-        after, before, roster = np.zeros((3, entries), np.int32)
-        vacated, touched = np.zeros((2, links), np.int32)
-        arrived, widowed, queue, order, round_of = np.zeros((5, flows), np.int32)
         return cls(
-            rows, np.zeros(flows, STORY), np.zeros((flows, width), np.int32), after, before, roads,
-            np.zeros(flows, HEAP), vacated, counters, np.zeros(log, LOG), arrived, widowed, np.zeros(flows), queue,
-            touched, roster, order, round_of, np.zeros(flows, EARLIEST), np.zeros(flows + 1, ROUND),
-            np.zeros(entries, UNDO),
+            rows, np.zeros(flows, STORY), np.zeros((flows, width), np.int32), np.zeros(entries, CHAIN), roads,
+            np.zeros(links, ROAD), np.zeros(flows, HEAP), counters, np.zeros(log, LOG), np.zeros(flows, NOTE),
+            np.zeros(flows), np.zeros(entries, np.int32), np.zeros(flows + 1, FROZEN), np.zeros(entries, UNDO),
         )  # fmt: skip
 
     def grown(self, flows: int, width: int, log: int) -> Tables:
         """Return larger tables with the same content; what the last rating left must have been forgotten."""
         new = Tables.room(flows, len(self.links), width, log)
         old, narrow = len(self.flows), self.hops.shape[1]
-        for name in ("flows", "story", "heap", "widowed", "log"):
+        for name in ("flows", "story", "heap", "notes", "log"):
             getattr(new, name)[: len(getattr(self, name))] = getattr(self, name)
-        for name in ("links", "vacated", "counters"):
+        for name in ("links", "roads", "counters"):
             getattr(new, name)[:] = getattr(self, name)
         new.hops[:old, :narrow] = self.hops
         for name in ("after", "before"):
-            table = getattr(self, name).reshape(old, narrow)
-            getattr(new, name).reshape(flows, width)[:old, :narrow] = _renumbered(table, narrow, width)
+            table = self.chain[name].reshape(old, narrow)
+            new.chain[name].reshape(flows, width)[:old, :narrow] = _renumbered(table, narrow, width)
         new.links["first"] = _renumbered(self.links["first"], narrow, width)
         return new
 
