@@ -8,6 +8,7 @@ import math
 import numpy as np
 import simpy
 
+from simrender.hardware.machine import Machine, load_machine
 from simrender.hardware.maxmin import max_min_rates
 from simrender.hardware.network import Link, Network
 
@@ -127,6 +128,19 @@ def test_a_pairwise_all_to_all_of_256_ranks_out_of_step(benchmark):
     # Sizes differ, so each message comes and goes at a tick of its own.
     result = benchmark.pedantic(pairwise, (256, 255, lambda s, t: 1e4 + (7919 * t + 104729 * s) % 4999), rounds=1)
     assert result == (256 * 255, 254_857)
+
+
+def test_a_pairwise_all_to_all_of_1024_nodes_of_a_fat_tree(benchmark):
+    """As MPI does it, on Stampede2: messages that cross between leaf switches share their up-links."""
+
+    def exchange():
+        env = simpy.Environment()
+        machine = Machine(env, load_machine("stampede2-skx", ["nodes=1024"]), 1024)
+        comm = machine.communicator()
+        env.run(env.all_of([comm.rank(i).alltoall(1e4, algorithm="pairwise") for i in range(1024)]))
+        return machine.network.flows_finished
+
+    assert benchmark.pedantic(exchange, rounds=1) == 1024 * 1023
 
 
 def test_the_solver_on_a_fat_tree(benchmark):

@@ -147,6 +147,8 @@ RayCount = Annotated[Quantity, _Reads(units.RAYS, allow_equal=True)]
 Count = Annotated[Quantity, _Reads(units.NUMBER)]
 Share = Annotated[Quantity, _Reads(units.NUMBER, at_most=1.0)]
 """A part of a whole: more than 0, at most 1, or a percentage."""
+Spread = Annotated[Quantity, _Reads(units.NUMBER, allow_equal=True, at_most=1.0)]
+"""A relative deviation: from 0 to 1, or a percentage."""
 
 
 class Card(BaseModel):

@@ -256,3 +256,17 @@ def test_images_with_fewer_scan_lines_than_gpus(tmp_path, size, policy):
     width, height = map(int, size.split("x"))
     assert result.counts["traced_paths"] == width * height * 2
     assert len(result.utilization) == 16
+
+
+def test_a_disturbance_that_begins_before_anything_is_sent():
+    """On islands of one GPU the network comes into being when finished pixels are merged."""
+    slow = {
+        "machine": [
+            "disturbances=[{link: gpu0.in, share: 0.1, start: 0 s}, {link: gpu1.out, share: 0, start: 0 s, end: 1 us}]"
+        ]
+    }
+    plain = simulate("rtx-server-a40", "landscape", overrides={"workload": ["traced.resolution=64x27"]})
+    disturbed = simulate("rtx-server-a40", "landscape", overrides={"workload": ["traced.resolution=64x27"], **slow})
+    assert disturbed.islands == plain.islands == 8
+    assert disturbed.frame_time_s > plain.frame_time_s
+    assert disturbed.image_sha256 == plain.image_sha256

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Generator, Iterator, Sequence
 from functools import cached_property
 from typing import Any, Literal
@@ -10,7 +11,7 @@ import numpy as np
 import simpy
 from pydantic import Field, model_validator
 
-from simrender.cards import Card, Duration, Quantity, Share
+from simrender.cards import Card, Duration, Quantity, Spread
 from simrender.catalog import find_card
 from simrender.clock import to_ticks
 from simrender.errors import CardError, UsageError, did_you_mean
@@ -37,7 +38,7 @@ class VariabilityCard(Card):
 
     """
 
-    spread: Share
+    spread: Spread
     distribution: Literal["normal", "lognormal"] = "normal"
     seed: int = Field(default=1, ge=0, strict=True)
 
@@ -45,7 +46,9 @@ class VariabilityCard(Card):
         """Return what every duration on a node is multiplied by."""
         draw = np.random.Generator(np.random.Philox(np.random.SeedSequence(self.seed, spawn_key=(node,)))).normal()
         if self.distribution == "normal":
-            bound = min(3.0, 0.9 / self.spread)  # nothing takes no time; and both sides alike, so that the mean stays
+            bound = min(
+                3.0, 0.9 / max(self.spread, 0.01)
+            )  # nothing takes no time; and both sides alike, so that the mean stays
             return 1.0 + self.spread * float(np.clip(draw, -bound, bound))
         width = np.sqrt(np.log1p(self.spread**2))
         return float(np.exp(width * draw - 0.5 * width**2))
@@ -126,6 +129,12 @@ class MachineCard(Card):
             raise ValueError("a machine has GPUs (gpus and the section gpu) or renders on its processors (section cpu)")
         if self.nodes > 1 and self.network is None:
             raise ValueError(f"{self.nodes} nodes need the section network, which says what connects them")
+        if self.gpus and self.network and not self.network.gpu_direct and self.host:
+            for way in ("to_device", "from_device"):
+                if getattr(self.host, way) is None:
+                    raise ValueError(
+                        f"messages of GPUs are staged (network.gpu_direct is false), which needs host.{way}"
+                    )
         self._check_fabrics()
         return self
 
@@ -290,10 +299,11 @@ class Machine:
         """The links between the devices, created when something is first sent."""
         topology = self._topology
         network = Network(self.env, topology.links, topology.route, nodes=topology.devices, record=self._record)
+        now = int(self.env.now)  # the network may come into being in the middle of a disturbance
         for entry in self.card.disturbances:
-            if entry.link in topology.links:
-                end = None if entry.end is None else to_ticks(entry.end)
-                network.disturb(entry.link, entry.share, to_ticks(entry.start), end)
+            end = None if entry.end is None else to_ticks(entry.end)
+            if entry.link in topology.links and (end is None or end > now):
+                network.disturb(entry.link, entry.share, max(now, to_ticks(entry.start)), end)
         return network
 
     @cached_property
@@ -376,9 +386,9 @@ class Machine:
     def copy(self, source: int, target: int, nbytes: float, *, start: int | None = None) -> simpy.Event:
         """Copy from one processor's memory to another's with the source's copy engines.
 
-        A copy between GPUs of different nodes is a message: straight from one to the other where the adapter can, else
-        staged through the memory of both hosts, which costs the links to both hosts, their memory, and the time of the
-        first and last piece.
+        A copy between processors of different nodes is an MPI message and pays for that. GPUs send straight to each
+        other where the adapter reaches them; else the message is staged through the memory of both hosts, which costs
+        the links to both, their memory, and the time of the first and last piece.
 
         Parameters
         ----------
@@ -394,11 +404,13 @@ class Machine:
 
         """
         begin = int(self.env.now) if start is None else start
-        between_nodes = self.node_of(source) != self.node_of(target)
-        delay = self._staging.delay_ticks(nbytes) if self._staging and between_nodes else 0
+        cap, delay = math.inf, 0
+        if self.node_of(source) != self.node_of(target):
+            cap, delay = self._transport.limit(source, target, nbytes)
+            begin += self._transport.overhead_ticks
 
         def transfer(tick: int) -> simpy.Event:
-            return self.network.transfer(source, target, nbytes, start=tick, delay=delay)
+            return self.network.transfer(source, target, nbytes, start=tick, cap=cap, delay=delay)
 
         return self._engine(source).submit(transfer, begin)
 
@@ -468,6 +480,13 @@ class Machine:
             If the card does not say which MPI there is.
 
         """
+        return Communicator(self.env, self._make_transport(ranks, hosts=hosts))
+
+    @cached_property
+    def _transport(self) -> Transport:
+        return self._make_transport(None, hosts=False)
+
+    def _make_transport(self, ranks: Sequence[int] | None, *, hosts: bool) -> Transport:
         if self.card.mpi is None:
             raise UsageError(f"{self.card.title} has no MPI on its card; add a section mpi")
         chosen = list(range(self.nodes if hosts else self._count) if ranks is None else ranks)
@@ -476,11 +495,10 @@ class Machine:
         combined = self.card.cpu if hosts or not self.card.gpus else self.card.gpu
         # Combining reads two operands and writes one.
         bandwidth = combined.memory_bandwidth / 3.0 if combined else np.inf
-        transport = Transport(
+        return Transport(
             self.network, self.card.mpi, endpoints, node_of=nodes, reduce_bandwidth=bandwidth,
-            staging=None if hosts else self._staging,
+            hosts=[("host", n) for n in nodes] if self.card.gpus else None, staging=None if hosts else self._staging,
         )  # fmt: skip
-        return Communicator(self.env, transport)
 
     # -- provenance -----------------------------------------------------------------------------------------------
 
@@ -491,28 +509,36 @@ class Machine:
         for path, quantity in card.processor.quantities(f"machine.{card.processor_section}."):
             if loads or not path.endswith(("build_rate", "parse_bandwidth")):
                 yield path, quantity
-        if self._cpus and card.cpu:
-            yield from card.cpu.quantities("machine.cpu.")
-        if card.host and self._hosts:
-            carried = self.network.carried_bytes if self.has_network else {}
-            copied = any(nbytes and str(link).endswith((".h2d", ".d2h")) for link, nbytes in carried.items())
-            for path, quantity in card.host.quantities("machine.host."):
-                if copied or not path.endswith(("_device", "copy_latency")):
-                    yield path, quantity
-        if card.variability:
-            yield from card.variability.quantities("machine.variability.")
+        carried = self.network.carried_bytes.items() if self.has_network else ()
+        used = [str(link) for link, nbytes in carried if nbytes]
+
+        def over(*links: str) -> bool:
+            return any(part in link for link in used for part in links)
+
+        def of(section: str, *left_out: str) -> Iterator[tuple[str, Quantity]]:
+            if found := getattr(card, section):
+                for path, quantity in found.quantities(f"machine.{section}."):
+                    if not any(part in path for part in left_out):
+                        yield path, quantity
+
+        if self._cpus:
+            yield from of("cpu")
+        elif card.gpus and card.cpu and over("staging", "memory"):
+            yield "machine.cpu.memory_bandwidth", card.cpu.memory_bandwidth
+        if self._hosts:
+            yield from of("host", *(() if over("h2d", "d2h") else ("_device", "copy_latency")))
+        yield from of("variability")
         if not self.has_network:
             return
-        for name in ("nvlink", "pcie"):
-            for path, quantity in getattr(card, name).quantities(f"machine.{name}.") if getattr(card, name) else ():
-                if self.kernels_read or not path.endswith(".kernel_share"):
-                    yield path, quantity
+        for fabric in ("nvlink", "pcie"):
+            yield from of(fabric, *(() if self.kernels_read else (".kernel_share",)))
+        if self.nodes > 1 or over(".nic."):
+            unused = [*(() if over("leaf") else (".leaf.",)), *(() if over("staging") else (".staging_block",))]
+            yield from of("network", *unused)
         if self.nodes > 1:
-            for name in ("network", "mpi"):
-                if section := getattr(card, name):
-                    yield from section.quantities(f"machine.{name}.")
-        if "storage" in self.__dict__ and card.storage:
-            yield from card.storage.quantities("machine.storage.")
+            yield from of("mpi")
+        if loads:
+            yield from of("storage")
 
 
 _COUNTER_BYTES = 4.0

@@ -135,6 +135,9 @@ class Transport:
         feel the card's ranges.
     reduce_bandwidth : float
         At which a rank combines what it received with its own, in B/s.
+    hosts : sequence of hashable, optional
+        The network's node of each rank's host, where the library runs; its own unless given. The card's latency factors
+        are those of the way between hosts: what a message says in advance does not go to a GPU.
     staging : Staging, optional
         Messages between nodes are staged through host memory.
 
@@ -159,6 +162,7 @@ class Transport:
         *,
         node_of: Sequence[int] | None = None,
         reduce_bandwidth: float = math.inf,
+        hosts: Sequence[Hashable] | None = None,
         staging: Staging | None = None,
     ) -> None:
         if not endpoints:
@@ -169,6 +173,7 @@ class Transport:
             raise ScheduleError(f"reduce_bandwidth must be above zero, got {reduce_bandwidth!r} B/s")
         self.network, self.card, self.reduce_bandwidth = network, card, reduce_bandwidth
         self.staging = staging
+        self._hosts = list(endpoints if hosts is None else hosts)
         self.size = len(endpoints)
         self.overhead_ticks = to_ticks(card.overhead)
         self._endpoints = list(endpoints)
@@ -209,14 +214,14 @@ class Transport:
         if not self._above and self.staging is None:
             self.network.post(*ends, nbytes, starts, listener, keys)
             return
-        limits = [self._limit(*message) for message in zip(senders, receivers, nbytes.tolist(), strict=True)]
+        limits = [self.limit(*message) for message in zip(senders, receivers, nbytes.tolist(), strict=True)]
         caps, delays = zip(*limits, strict=True) if limits else ((), ())
         self.network.post(*ends, nbytes, starts, listener, keys, caps=caps, delays=delays)
 
     def alpha_beta(self, source: int, target: int, nbytes: float) -> tuple[float, float]:
         """Return what a message costs that has the links to itself: seconds before its first byte, seconds a byte."""
         ends = self._endpoints[source], self._endpoints[target]
-        cap, delay = self._limit(source, target, nbytes)
+        cap, delay = self.limit(source, target, nbytes)
         alpha_s = to_seconds(self.overhead_ticks + self.network.latency_ticks(*ends) + delay)
         return alpha_s, 1.0 / min(self.network.bandwidth(*ends), cap)
 
@@ -228,7 +233,7 @@ class Transport:
         """Return `reduce_seconds` of each of many, in ticks."""
         return _whole_ticks(np.asarray(nbytes, np.float64) / self.reduce_bandwidth * TICKS_PER_SECOND)
 
-    def _limit(self, source: int, target: int, nbytes: float) -> tuple[float, int]:
+    def limit(self, source: int, target: int, nbytes: float) -> tuple[float, int]:
         """Return the most that a message gets in B/s, and its latency beside the route's in ticks."""
         if self._node_of[source] == self._node_of[target]:
             return math.inf, 0
@@ -236,8 +241,8 @@ class Transport:
         row = bisect.bisect_right(self._above, nbytes)
         if not row:
             return math.inf, staged
-        ends = self._endpoints[source], self._endpoints[target]
-        route = self.network.bandwidth(*ends), self.network.latency_ticks(*ends)
+        ends, hosts = (self._endpoints[source], self._endpoints[target]), (self._hosts[source], self._hosts[target])
+        route = self.network.bandwidth(*ends), self.network.latency_ticks(*hosts)
         limits = self._limits_of.get(route)
         if limits is None:  # routes of a machine differ in little else than their links
             bandwidth, latency = route

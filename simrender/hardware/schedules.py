@@ -335,7 +335,19 @@ def _allreduce_ring(ranks: int, nbytes: NDArray[np.float64]) -> _Rows:
 
 
 def _reduce_scatter_halving(ranks: int, nbytes: NDArray[np.float64]) -> _Rows:
-    return _halving(ranks, _cut(nbytes, ranks), _masks(ranks)[::-1])[0]
+    """Halve what is left, at distances falling to 1; ranks beyond a power of two hand in first and get theirs (MPICH).
+
+    Of a pair that hands in, the rank that goes on is after the blocks of both.
+    """
+    names, stay, wait = _fold(ranks)
+    spans, size = _cut(nbytes, ranks), float(nbytes.sum())
+    bounds = np.concatenate([wait, names[len(wait) :], [ranks]])  # each who goes on: from its block up to the next's
+    masks = _masks(len(names))
+    rows, _ = _halving(
+        len(names), lambda first, count: spans(bounds[first], bounds[first + count] - bounds[first]), masks[::-1]
+    )
+    result = (1 + len(masks), stay, wait, spans(wait, 1), False)
+    return [(0, wait, stay, size, True), *_later(_renamed(rows, names), 1), result]
 
 
 def _reduce_scatter_pairwise(ranks: int, nbytes: NDArray[np.float64]) -> _Rows:
@@ -437,7 +449,6 @@ INSTEAD: Final[Mapping[tuple[str, str], str]] = {
     ("allgather", "neighbor_exchange"): "ring",
     ("allgatherv", "recursive_doubling"): "bruck",
     ("allgatherv", "neighbor_exchange"): "ring",
-    ("reduce_scatter", "recursive_halving"): "pairwise",
 }
 """Algorithms that need a power of two (the neighbour exchange: an even number) of ranks, and what takes any number."""
 
@@ -460,7 +471,11 @@ def closed_form(
     - for any number of ranks if a sender waits for its receiver (rendezvous);
     - if messages are eager, where the algorithm treats all ranks alike (dissemination, ring, Bruck, pairwise and
       neighbour exchange), and for powers of two, but for the two broadcasts that scatter. Elsewhere an eager sender
-      runs ahead of this: it ends a tree earlier, but where it sends twice to one rank it shares the links with itself.
+      runs ahead of this.
+
+    The same holds on a star, one link up and one down a rank, as a rank sends eager messages one after the other. Where
+    a rank gets several at once, as the root of a binomial gather that is no power of two may, they share its link, but
+    no later than in sequence.
 
     The direct algorithms (linear, scattered) are stated for one message after the other; a simulated rank sends them
     together, so that only overhead and contention keep them apart.
@@ -496,6 +511,8 @@ def closed_form(
     extra = power < p  # ranks that hand in and are told the result
     lg = power.bit_length() - 1
     part, power_part = n * (p - 1) / p, n * (power - 1) / power
+    # Who handed in with another halves the blocks of two; the lower halves have most of these.
+    halves = n / p * sum(mask + min(mask, p - power) for mask in _masks(power))
     popcounts = sum(distance.bit_count() for distance in range(p)) if algorithm == "bruck" else 0
     messages, sent, combined = {
         ("barrier", "dissemination"): (levels, 0.0, 0.0),
@@ -507,7 +524,7 @@ def closed_form(
         ("allreduce", "recursive_doubling"): (lg + 2 * extra, (lg + 2 * extra) * n, (lg + extra) * n),
         ("allreduce", "rabenseifner"): (2 * lg + 2 * extra, 2.0 * power_part + 2 * extra * n, power_part + extra * n),
         ("allreduce", "ring"): (2 * (p - 1), 2.0 * part, part),
-        ("reduce_scatter", "recursive_halving"): (lg, part, part),
+        ("reduce_scatter", "recursive_halving"): (lg + 2 * extra, halves + extra * (n + n / p), halves + extra * n),
         ("reduce_scatter", "pairwise"): (p - 1, part, part),
         ("allgather", "recursive_doubling"): (lg, (p - 1) * n, 0.0),
         ("allgather", "bruck"): (levels, (p - 1) * n, 0.0),

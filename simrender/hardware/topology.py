@@ -187,10 +187,11 @@ class Topology:
 
     def __init__(self, card: Any, nodes: int) -> None:
         self.card, self.nodes = card, nodes
+        self._places: dict[Hashable, tuple[str, int, int | None] | None] = {}
         self.links: dict[Hashable, Link] = {}
         for node in range(nodes):
             self._add_node(node)
-        if card.network is not None and nodes > 1:
+        if self.has_network:
             self._add_network()
         if card.storage is not None:
             from simrender.hardware.storage import storage_links
@@ -223,6 +224,8 @@ class Topology:
         for gpu in range(card.gpus):
             if lanes is not None:
                 self._add_lanes(f"{p}gpu{gpu}", lanes)
+            if card.pcie:
+                self._add_slot(f"{p}gpu{gpu}")
             if host := card.host:
                 lane_latency = 0.5 * card.pcie.latency if card.pcie else 0.0
                 latency = max(0.0, host.copy_latency - lane_latency)
@@ -240,15 +243,25 @@ class Topology:
                 for b in range(len(pcie.sockets or [])):
                     if a != b:
                         self.links[f"{p}socket{a}-socket{b}"] = Link(pcie.socket_link)
-        if card.cpu is not None and card.network is not None and not card.network.gpu_direct and card.gpus:
+        if card.cpu is not None and card.gpus:
+            self.links[f"{p}memory"] = Link(card.cpu.memory_bandwidth)
+        if card.cpu is not None and card.gpus and card.network is not None and not card.network.gpu_direct:
             # What is staged is written to memory and read from it again.
             self.links[f"{p}staging"] = Link(0.5 * card.cpu.memory_bandwidth)
 
     def _add_lanes(self, name: str, fabric: FabricCard) -> None:
-        """Add a GPU's lanes out and in, and its port, which cannot run both at full speed at once."""
+        """Add what a GPU can send to others and get from them, and its port, which cannot do both at full speed."""
         lane = float(fabric.bandwidth)
         self.links[f"{name}.out"] = self.links[f"{name}.in"] = Link(lane)
-        self.links[f"{name}.port"] = Link(2.0 * lane * fabric.duplex, 0.5 * fabric.latency)
+        latency = 0.0 if isinstance(fabric, PcieCard) else 0.5 * fabric.latency  # that of PCIe is its slot's
+        self.links[f"{name}.port"] = Link(2.0 * lane * fabric.duplex, latency)
+
+    def _add_slot(self, name: str) -> None:
+        """Add the lanes of a GPU's slot, which all its traffic shares: with other GPUs, the host and the adapter."""
+        pcie, host = self.card.pcie, self.card.host
+        for way, of_host in (("up", host.from_device), ("down", host.to_device)):
+            bandwidth = max(float(pcie.bandwidth), float(of_host or 0.0))
+            self.links[f"{name}.slot.{way}"] = Link(bandwidth, 0.5 * pcie.latency)
 
     def _add_network(self) -> None:
         network = self.card.network
@@ -276,7 +289,7 @@ class Topology:
         """Return the links from one device to another, or None where there is no way."""
         if source == target:
             return ()
-        a, b = self._place(source), self._place(target)
+        a, b = self._known_place(source), self._known_place(target)
         if a is None or b is None:
             return None
         (kind, node, gpu), (target_kind, other, other_gpu) = a, b
@@ -293,13 +306,18 @@ class Topology:
     @property
     def has_network(self) -> bool:
         """Whether there is anything between nodes."""
-        return self.card.network is not None and self.nodes > 1
+        return self.card.network is not None and self.card.nodes > 1
 
     def staged(self, source: Hashable, target: Hashable) -> bool:
         """Tell whether a message between two devices is staged through host memory."""
         a, b = self._place(source), self._place(target)
         gpus = [place for place in (a, b) if place is not None and place[2] is not None]
         return bool(gpus) and a is not None and b is not None and a[1] != b[1] and not self.card.network.gpu_direct
+
+    def _known_place(self, device: Hashable) -> tuple[str, int, int | None] | None:
+        if device not in self._places:
+            self._places[device] = self._place(device)
+        return self._places[device]
 
     def _place(self, device: Any) -> tuple[str, int, int | None] | None:
         """Return what kind of device it is, on which node, and which of the node's GPUs."""
@@ -340,18 +358,18 @@ class Topology:
         p, nic = self.prefix(node), f"{self.prefix(node)}nic.out"
         if gpu is None:
             return (nic,)
-        if not self.card.network.gpu_direct:
-            return (*self._copy(node, gpu, out=True), *self._staging(p), nic)
         across = self._across(node, self._socket(gpu), self.card.network.socket)
+        if not self.card.network.gpu_direct:
+            return (*self._copy(node, gpu, out=True), *across, *self._staging(p), nic)
         return (*(self._up(node, gpu) or self._copy(node, gpu, out=True)), *across, nic)
 
     def _from_nic(self, node: int, gpu: int | None) -> tuple[str, ...]:
         p, nic = self.prefix(node), f"{self.prefix(node)}nic.in"
         if gpu is None:
             return (nic,)
-        if not self.card.network.gpu_direct:
-            return (nic, *self._staging(p), *self._copy(node, gpu, out=False))
         across = self._across(node, self.card.network.socket, self._socket(gpu))
+        if not self.card.network.gpu_direct:
+            return (nic, *self._staging(p), *across, *self._copy(node, gpu, out=False))
         return (nic, *across, *(self._down(node, gpu) or self._copy(node, gpu, out=False)))
 
     def _staging(self, p: str) -> tuple[str, ...]:
@@ -360,35 +378,34 @@ class Topology:
     def _inside(self, node: int, gpu: int | None, other: int | None) -> tuple[str, ...] | None:
         """Return the links between two GPUs of a node, or between one and the memory of the host."""
         card, p = self.card, self.prefix(node)
-        if gpu is None and other is None:
-            return ()
-        if gpu is None or other is None:
-            return self._copy(node, gpu, out=True) if gpu is not None else self._copy(node, other, out=False)
+        if other is None:
+            return () if gpu is None else (*self._copy(node, gpu, out=True), *self._memory(p))
+        if gpu is None:
+            return (*self._memory(p), *self._copy(node, other, out=False))
         nvlink, pcie = card.nvlink, card.pcie
+        one, two = f"{p}gpu{gpu}", f"{p}gpu{other}"
         if nvlink and nvlink.pairs is None:
-            return f"{p}gpu{gpu}.out", f"{p}gpu{gpu}.port", f"{p}gpu{other}.port", f"{p}gpu{other}.in"
+            return f"{one}.out", f"{one}.port", f"{two}.port", f"{two}.in"
         if nvlink and (pair := _group_of(nvlink.pairs, gpu)) is not None and pair == _group_of(nvlink.pairs, other):
             a, b = nvlink.pairs[pair]
             return f"{p}gpu{gpu}-gpu{other}", f"{p}gpu{a}+gpu{b}"
         if pcie is None:
             return None
         if _group_of(pcie.switches, gpu) == _group_of(pcie.switches, other) is not None:
-            return f"{p}gpu{gpu}.out", f"{p}gpu{gpu}.port", f"{p}gpu{other}.port", f"{p}gpu{other}.in"
-        across = self._across(node, self._socket(gpu), self._socket(other))
-        return (*self._up(node, gpu), *across, *self._down(node, other))
+            between: tuple[str, ...] = (f"{one}.slot.up", f"{two}.slot.down")
+        else:
+            across = self._across(node, self._socket(gpu), self._socket(other))
+            between = (*self._up(node, gpu), *across, *self._down(node, other))
+        return f"{one}.out", f"{one}.port", *between, f"{two}.port", f"{two}.in"
 
-    def _copy(self, node: int, gpu: int | None, *, out: bool) -> tuple[str, ...]:
-        """Return the links of a copy between a GPU and the memory of the host."""
-        if gpu is None:
-            return ()
-        name = f"{self.prefix(node)}gpu{gpu}"
-        own, lane = (f"{name}.d2h", f"{name}.out") if out else (f"{name}.h2d", f"{name}.in")
-        way = self._up(node, gpu) if out else self._down(node, gpu)
-        if own not in self.links:
-            return way
-        # What a copy to or from the host gets is known by itself; it shares the port with what goes between GPUs.
-        way = tuple(link for link in way if link != lane)
-        return (*way, own) if out else (own, *way)
+    def _memory(self, p: str) -> tuple[str, ...]:
+        return (f"{p}memory",) if f"{p}memory" in self.links else ()
+
+    def _copy(self, node: int, gpu: int, *, out: bool) -> tuple[str, ...]:
+        """Return the links of a copy between a GPU and its host, as far as the host's memory."""
+        own = f"{self.prefix(node)}gpu{gpu}.{'d2h' if out else 'h2d'}"
+        known = (own,) if own in self.links else ()
+        return (*self._up(node, gpu), *known) if out else (*known, *self._down(node, gpu))
 
     def _up(self, node: int, gpu: int) -> tuple[str, ...]:
         """Return the links from a GPU to the root complex of its socket."""
@@ -396,14 +413,14 @@ class Topology:
         if pcie is None:
             return ()
         switch = _group_of(pcie.switches, gpu)
-        return f"{p}gpu{gpu}.out", f"{p}gpu{gpu}.port", *(() if switch is None else (f"{p}switch{switch}.up",))
+        return f"{p}gpu{gpu}.slot.up", *(() if switch is None else (f"{p}switch{switch}.up",))
 
     def _down(self, node: int, gpu: int) -> tuple[str, ...]:
         pcie, p = self.card.pcie, self.prefix(node)
         if pcie is None:
             return ()
         switch = _group_of(pcie.switches, gpu)
-        return *(() if switch is None else (f"{p}switch{switch}.down",)), f"{p}gpu{gpu}.port", f"{p}gpu{gpu}.in"
+        return *(() if switch is None else (f"{p}switch{switch}.down",)), f"{p}gpu{gpu}.slot.down"
 
     def _across(self, node: int, socket: int | None, other: int | None) -> tuple[str, ...]:
         if socket is None or other is None or socket == other:

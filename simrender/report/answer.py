@@ -37,6 +37,8 @@ def answer(result: Result) -> RenderableType:
     table.add_row("where the time went", _bar(result.breakdown))
     if result.busiest_link:
         table.add_row("busiest link", _busiest(result, result.busiest_link))
+    if any(what.startswith("staging") for what in result.scope["modelled"]):
+        table.add_row("", "messages between nodes are staged: two copies, over host links")
     table.add_row("rays", _rays(result))
     table.add_row("left out", Text("; ".join(item["what"] for item in result.scope["left_out"]), style="dim"))
     title = Text(f"{result.workload} on {result.machine} under {result.policy}", style="bold underline")

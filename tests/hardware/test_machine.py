@@ -67,13 +67,15 @@ def test_cores_are_named_when_they_work_beside_gpus():
 
 
 @pytest.mark.parametrize("name", CLUSTERS)
-def test_one_node_of_a_cluster_has_no_network(name):
+def test_one_node_of_a_cluster_has_its_adapter_and_no_use_for_it(name):
     card = load(name)
     machine = Machine(simpy.Environment(), card, card.node_processors)
-    assert not machine.topology.has_network
     assert machine.network
     assert paths(machine, "network") == paths(machine, "mpi") == []
-    assert not any(".nic." in str(link) or "leaf" in str(link) for link in machine.topology.links)
+    if card.storage:
+        assert machine.topology.route("storage", ("host", 0)) == ("storage", "node0.client", "node0.nic.in")
+    if card.display:
+        assert machine.topology.route(0, ("display", 0)) == ("node0.nic.out",)
 
 
 def test_a_machine_without_a_section_says_so():
