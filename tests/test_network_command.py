@@ -233,6 +233,23 @@ def test_the_table_says_what_the_json_does(run_cli, card):
     assert "staged" not in ran.out
 
 
+@pytest.mark.parametrize(
+    ("arguments", "reason"),
+    [
+        (["allgather", "--algorithm", "ring"], "most pairs are faster than that or eager senders run ahead"),
+        (["alltoall", "--algorithm", "linear"], "the closed form sends one message after the other"),
+        (
+            ["alltoall", "--bytes", "32KiB,1MiB"],
+            "most pairs are faster than that or eager senders run ahead, or the closed form sends one message after "
+            "the other",
+        ),
+    ],
+)
+def test_a_ratio_below_one_is_explained_by_the_algorithm(run_cli, card, arguments, reason):
+    out = run_cli("network", card, *arguments).out
+    assert f"ratio: time over closed form; below 1 where {reason}" in " ".join(out.split())
+
+
 def test_the_table_fits_into_a_hundred_columns(run_cli, monkeypatch):
     monkeypatch.setenv("COLUMNS", "100")
     ran = run_cli("network", "frontera-rtx:staged", "bcast", "--bytes", "64KiB,4MiB", "--ranks", "4,16")

@@ -23,6 +23,7 @@ import numpy as np
 import simpy
 from numpy.typing import ArrayLike, NDArray
 
+from simrender.clock import to_seconds, to_ticks
 from simrender.errors import ScheduleError
 from simrender.hardware.executor import Execution
 from simrender.hardware.mpi import Transport, choose
@@ -52,6 +53,25 @@ class Message:
     tag: int
     nbytes: float
     tick: int
+
+
+def run_until(event: simpy.Event, *communicators: Communicator) -> Any:
+    """Run a simulation until an event has succeeded; return its value.
+
+    Raises
+    ------
+    ScheduleError
+        If nothing is left to happen before, with what the communicators still wait for (`Communicator.unmatched`).
+
+    """
+    try:
+        while not event.processed:
+            event.env.step()
+    except simpy.core.EmptySchedule:
+        waits = "\n".join(filter(None, (communicator.unmatched() for communicator in communicators)))
+        seconds = to_seconds(int(event.env.now))
+        raise ScheduleError(f"the ranks came to a standstill at {seconds:.9g} s: {waits or 'nobody acts'}") from None
+    return event.value
 
 
 class Communicator:
@@ -201,15 +221,21 @@ class Communicator:
         self._check_rank(target)
         if not 0.0 <= nbytes < math.inf:
             raise ScheduleError(f"a message's size must be finite and not negative, got {nbytes!r} B")
-        overhead = self.transport.overhead_ticks
+        is_eager = nbytes <= self.transport.card.eager
         ready = max(self._now, source.free_at)
-        source.free_at = ready + overhead
+        if is_eager:
+            place, busy_until = self.ranks[source.index], self.transport.busy_until
+            ready = max(ready, int(busy_until[place]))
+        source.free_at = ready + self.transport.overhead_ticks
         sent = _Sent(self._sent, source.index, target, tag, float(nbytes), ready, simpy.Event(self.env))
         self._sent += 1
         self._mailbox(target).messages.setdefault(sent.source, []).append(sent)
-        if nbytes <= self.transport.card.eager:
-            self._leave(sent, ready + overhead)
-            _succeed_at(sent.done, ready + overhead, ready + overhead)
+        if is_eager:
+            tick = self._leave(sent, ready)
+            _, s_per_byte = self.transport.alpha_beta(place, self.ranks[target], sent.nbytes)
+            busy_until[place] = tick + to_ticks(sent.nbytes * s_per_byte)
+            source.free_at = tick
+            _succeed_at(sent.done, tick, tick)
         else:
             self._show(sent)
         return sent.done
@@ -227,10 +253,19 @@ class Communicator:
             self._mailboxes[target] = _Mailbox()
         return self._mailboxes[target]
 
-    def _leave(self, sent: _Sent, tick: int) -> None:
+    def _leave(self, sent: _Sent, ready: int) -> int:
+        """Send a message as soon as its sender has an overhead to spare for it; return when."""
+        overhead, source = self.transport.overhead_ticks, self._members[sent.source]
+        tick = ready + overhead
+        source.leaving = sorted(other for other in source.leaving if other > self._now)
+        for other in source.leaving:
+            if abs(other - tick) < overhead:
+                tick = other + overhead
+        source.leaving.append(tick)
         self._sends[sent.number] = sent
         ends = np.array([sent.source]), np.array([sent.target])
         self._post(*ends, np.array([sent.nbytes]), np.array([tick]), self._arrive, np.array([sent.number]))
+        return tick
 
     def _arrive(self, keys: NDArray[np.int64], tick: int) -> None:
         for number in keys.tolist():
@@ -260,8 +295,7 @@ class Communicator:
                 _succeed_at(receive.done, self._now, sent.as_message(self._now))
             else:
                 sent.receive = receive
-                ready = max(sent.ready, self._now)  # later than both if an earlier message kept it back
-                self._leave(sent, ready + self.transport.overhead_ticks)
+                self._leave(sent, max(sent.ready, self._now))  # later than both if an earlier message kept it back
 
 
 def _succeed_at(event: simpy.Event, tick: int, value: Any) -> None:
@@ -310,6 +344,8 @@ class _Collective:
         algorithm = call.algorithm or choose(transport.card.flavour, call.name, comm.size, mean)
         table = call.schedule(algorithm, comm.size)
         self.events: dict[int, simpy.Event] = {}
+        by_row = call.name == "alltoallv"
+        places = comm._numbers
         self.execution = Execution(
             table,
             transport.reduce_ticks(table.reduce_bytes),
@@ -317,14 +353,23 @@ class _Collective:
             float(transport.card.eager),
             self._post,
             self._finish,
-            by_row=call.name == "alltoallv",
+            gaps=None if by_row else transport.gap_ticks(places[table.source], places[table.target], table.nbytes),
+            adapters=transport.busy_until,
+            places=places,
+            by_row=by_row,
             sends_empty=call.name != "alltoallv" or algorithm == "pairwise",
         )
 
     def begin(self, rank: int, row: NDArray[np.float64] | None) -> simpy.Event:
         """Let a rank begin; return the event of its being done."""
         done = self.events[rank] = simpy.Event(self.comm.env)
-        self.execution.begin(rank, self.comm._now, *([] if row is None else [row]))
+        if row is None:
+            self.execution.begin(rank, self.comm._now)
+        else:
+            places = self.comm._numbers
+            moved = np.where(np.arange(len(row)) == rank, 0.0, row)
+            gaps = self.comm.transport.gap_ticks(np.full(len(row), places[rank]), places, moved)
+            self.execution.begin(rank, self.comm._now, row, gaps)
         return done
 
     def _post(self, sources: Any, targets: Any, nbytes: Any, starts: Any, keys: NDArray[np.int64]) -> None:
@@ -404,11 +449,14 @@ class Rank:
         Its number in the communicator.
     free_at : int
         The tick at which the last of its own sends has cost its overhead.
+    leaving : list of int
+        The ticks at which messages leave that have yet to.
 
     """
 
     def __init__(self, comm: Communicator, index: int) -> None:
         self.comm, self.index, self.free_at = comm, index, 0
+        self.leaving: list[int] = []
 
     def barrier(self, *, algorithm: str | None = None) -> simpy.Event:
         """Wait until all have come."""
@@ -476,7 +524,8 @@ class Rank:
     def isend(self, target: int, nbytes: float, tag: int = 0) -> simpy.Event:
         """Send a message; done when it has left, or when it has arrived if it is too large to be eager.
 
-        Sends of one rank leave at least an overhead apart.
+        Sends of one rank leave at least an overhead apart, and an eager one not before the rank's adapter can be
+        through with the eager ones before it, those of collectives among them.
 
         Raises
         ------

@@ -2,7 +2,8 @@
 
 A message pays the sender's overhead and the latency of its route, then shares the links with whatever else is under way
 (`simrender.hardware.network`). That is LogGP (Alexandrov et al., "LogGP: incorporating long messages into the LogP
-model", SPAA 1995) with its gap replaced by the fluid network.
+model", SPAA 1995) with its gap replaced by the fluid network, but for eager messages of one rank: its adapter sends
+these in order, each when it could be through with the one before.
 """
 
 from __future__ import annotations
@@ -146,6 +147,9 @@ class Transport:
     size : int
         How many ranks there are.
     overhead_ticks : int
+    busy_until : int64 array, (size,)
+        The tick at which each rank's adapter is through with its eager messages, as far as they are known. Whoever
+        sends keeps it up to date.
 
     Raises
     ------
@@ -178,7 +182,11 @@ class Transport:
         self.overhead_ticks = to_ticks(card.overhead)
         self._endpoints = list(endpoints)
         self._node_of = list(range(self.size) if node_of is None else node_of)
+        self._node_array = np.array(self._node_of)
+        self.busy_until = np.zeros(self.size, np.int64)
         self._above = [float(r.above) for r in card.ranges]
+        self._bandwidths: NDArray[np.float64] | None = None  # (size, size); not a number until asked for
+        self._shares = np.array([1.0, *(min(1.0, float(r.bandwidth)) for r in card.ranges)])
         self._limits_of: dict[tuple[float, int], list[tuple[float, int]]] = {}
 
     def post(
@@ -217,6 +225,40 @@ class Transport:
         limits = [self.limit(*message) for message in zip(senders, receivers, nbytes.tolist(), strict=True)]
         caps, delays = zip(*limits, strict=True) if limits else ((), ())
         self.network.post(*ends, nbytes, starts, listener, keys, caps=caps, delays=delays)
+
+    def gap_ticks(
+        self, sources: NDArray[np.integer[Any]], targets: NDArray[np.integer[Any]], nbytes: NDArray[np.float64]
+    ) -> NDArray[np.int64]:
+        """Return for how long eager messages keep their senders' adapters; 0 for larger ones.
+
+        That is the time of their bytes with the links to themselves (LogGP's G). Ranks and sizes as for `post`.
+
+        Raises
+        ------
+        UnreachableError
+            If no route connects two of the ranks.
+
+        """
+        gaps = np.zeros(len(nbytes), np.int64)
+        eager = np.flatnonzero((nbytes > 0.0) & (nbytes <= float(self.card.eager)))
+        if not len(eager):
+            return gaps
+        sources, targets = sources[eager], targets[eager]
+        if self._bandwidths is None:
+            self._bandwidths = np.full((self.size, self.size), np.nan)
+        rates = self._bandwidths[sources, targets]
+        unknown = np.flatnonzero(np.isnan(rates))
+        if len(unknown):
+            nodes, bandwidth = self._endpoints, self.network.bandwidth
+            pairs = zip(sources[unknown].tolist(), targets[unknown].tolist(), strict=True)
+            rates[unknown] = [bandwidth(nodes[source], nodes[target]) for source, target in pairs]
+            self._bandwidths[sources, targets] = rates
+        if self._above:
+            apart = self._node_array[sources] != self._node_array[targets]
+            rows = np.searchsorted(self._above, nbytes[eager], "right")
+            rates *= np.where(apart, self._shares[rows], 1.0)
+        gaps[eager] = _whole_ticks(nbytes[eager] / rates * TICKS_PER_SECOND)
+        return gaps
 
     def alpha_beta(self, source: int, target: int, nbytes: float) -> tuple[float, float]:
         """Return what a message costs that has the links to itself: seconds before its first byte, seconds a byte."""

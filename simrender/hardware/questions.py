@@ -17,7 +17,7 @@ import simpy
 from simrender.cards import Quantity
 from simrender.clock import to_seconds
 from simrender.errors import UnknownNameError, UsageError, did_you_mean
-from simrender.hardware.collectives import Communicator
+from simrender.hardware.collectives import Communicator, run_until
 from simrender.hardware.display import DisplayReport, simulate_display
 from simrender.hardware.machine import Machine, MachineCard, check_processors
 from simrender.hardware.mpi import choose
@@ -197,7 +197,8 @@ def ask_collective(
     arguments: list[Any] = [nbytes] if collective not in _VECTORS else [[nbytes] * ranks]
     arguments = [] if collective == "barrier" else arguments
     members = [comm.rank(index) for index in range(ranks)]
-    env.run(env.all_of([getattr(member, collective)(*arguments, algorithm=algorithm) for member in members]))
+    done = [getattr(member, collective)(*arguments, algorithm=algorithm) for member in members]
+    run_until(env.all_of(done), comm)
     table = _schedule(collective, algorithm, ranks, nbytes)
     alpha_s, beta_s_per_byte = _slowest(comm, table)
     gamma_s_per_byte = comm.transport.reduce_seconds(1.0) if collective in _REDUCING else 0.0
@@ -248,7 +249,7 @@ def ask_transfer(
     else:
         comm = machine.communicator(hosts=hosts)
         comm.rank(source).isend(target, nbytes)
-        env.run(comm.rank(target).irecv(source))
+        run_until(comm.rank(target).irecv(source), comm)
         alpha_s, beta_s_per_byte = comm.transport.alpha_beta(source, target, nbytes)
     closed_form_s = alpha_s + nbytes * beta_s_per_byte
     costs = alpha_s, beta_s_per_byte, 0.0

@@ -108,7 +108,7 @@ def schedule(collective: str, algorithm: str, ranks: int, nbytes: Sizes = 0.0, r
         raise ScheduleError(f"the size of {collective} for {ranks} ranks is {expected}, got the shape {sizes.shape}")
     rows = build(ranks, np.roll(sizes, -root) if collective == "gatherv" else sizes) if ranks > 1 else []
     table = _table(ranks, rows, root)
-    if collective in {"alltoallv", "gatherv"} and algorithm in {"scattered", "linear"}:
+    if collective in {"alltoallv", "gatherv"} and algorithm in DIRECT:
         table = _without_empty(table)  # as MPICH and Open MPI do, but not in their pairwise exchange
     return table
 
@@ -409,7 +409,7 @@ _GATHER: Final[dict[str, Callable[[int, NDArray[np.float64]], _Rows]]] = {
     "binomial": lambda ranks, sizes: _up(ranks, _spans(sizes), reduces=False),
     "linear": _to_root,
 }
-_DIRECT: Final = {"pairwise": _pairwise, "scattered": _at_once(THROTTLE), "linear": _at_once(0)}
+_EXCHANGE: Final = {"pairwise": _pairwise, "scattered": _at_once(THROTTLE), "linear": _at_once(0)}
 
 _BUILDERS: Final[dict[str, dict[str, Callable[[int, NDArray[np.float64]], _Rows]]]] = {
     "barrier": {
@@ -433,8 +433,8 @@ _BUILDERS: Final[dict[str, dict[str, Callable[[int, NDArray[np.float64]], _Rows]
     },
     "allgather": _ALLGATHER,
     "allgatherv": _ALLGATHER,
-    "alltoall": {**_DIRECT, "bruck": _alltoall_bruck},
-    "alltoallv": _DIRECT,
+    "alltoall": {**_EXCHANGE, "bruck": _alltoall_bruck},
+    "alltoallv": _EXCHANGE,
     "gather": _GATHER,
     "gatherv": _GATHER,
     "reduce_scatter": {"recursive_halving": _reduce_scatter_halving, "pairwise": _reduce_scatter_pairwise},
@@ -442,6 +442,9 @@ _BUILDERS: Final[dict[str, dict[str, Callable[[int, NDArray[np.float64]], _Rows]
 
 ALGORITHMS: Final[Mapping[str, tuple[str, ...]]] = {name: tuple(known) for name, known in _BUILDERS.items()}
 """The algorithms of each collective."""
+
+DIRECT: Final = ("linear", "scattered")
+"""Algorithms in which a rank sends, or the root gets, many messages together."""
 
 INSTEAD: Final[Mapping[tuple[str, str], str]] = {
     ("bcast", "scatter_recursive_doubling_allgather"): "scatter_ring_allgather",
@@ -466,19 +469,17 @@ def closed_form(
 
     A message of n bytes takes alpha + n beta, combining n bytes n gamma: the costs of Thakur, Rabenseifner and Gropp
     (2005, section 3 and table 1) and of the comments in MPICH's sources, here also for numbers of ranks that are no
-    power of two. On a full crossbar a simulated schedule takes exactly that
+    power of two. A simulated schedule takes exactly that on a full crossbar, and on a star of one link up and one down
+    a rank,
 
     - for any number of ranks if a sender waits for its receiver (rendezvous);
     - if messages are eager, where the algorithm treats all ranks alike (dissemination, ring, Bruck, pairwise and
-      neighbour exchange), and for powers of two, but for the two broadcasts that scatter. Elsewhere an eager sender
-      runs ahead of this.
+      neighbour exchange), and for powers of two. Elsewhere an eager sender runs ahead of this: it ends a tree earlier,
+      but on a star its message shares the way in with one that the receiver waits for first, as in a reduction by ranks
+      of which some hand in.
 
-    The same holds on a star, one link up and one down a rank, as a rank sends eager messages one after the other. Where
-    a rank gets several at once, as the root of a binomial gather that is no power of two may, they share its link, but
-    no later than in sequence.
-
-    The direct algorithms (linear, scattered) are stated for one message after the other; a simulated rank sends them
-    together, so that only overhead and contention keep them apart.
+    The direct algorithms (linear, scattered) are stated for one message after the other; a simulated rank does not wait
+    for one to arrive before it sends the next, so that latencies overlap.
 
     Parameters
     ----------

@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from simrender.hardware.questions import GATHERING, Answer
+from simrender.hardware.schedules import DIRECT
 from simrender.result import owned_up
 from simrender.units import format_bytes, format_seconds
 
@@ -139,13 +140,24 @@ def _notes(card: MachineCard, answers: Sequence[Answer], given: str | None) -> I
         yield Text(
             f"closed form: alpha-beta-gamma, with the longest latency and lowest bandwidth used{slowest}", style="dim"
         )
-        yield Text("ratio: time over closed form; below 1 where most pairs are faster than that", style="dim")
+        yield Text(f"ratio: time over closed form; below 1 where {_ahead(answers)}", style="dim")
     if card.mpi and first.algorithm:
         how = f"chosen by the switch points of {card.mpi.flavour}" if given is None else "as asked for"
         yield Text(f"algorithm: {how}", style="dim")
     if any(answer.staged for answer in answers):
         yield Text("staged through host memory: two host links more", style="dim")
     yield calibration(_uncalibrated(answers))
+
+
+def _ahead(answers: Sequence[Answer]) -> str:
+    """Return why a collective may take less than its closed form."""
+    serial = [answer.algorithm in DIRECT for answer in answers]
+    reasons = []
+    if not all(serial):
+        reasons.append("most pairs are faster than that or eager senders run ahead")
+    if any(serial):
+        reasons.append("the closed form sends one message after the other")
+    return ", or ".join(reasons)
 
 
 def calibration(uncalibrated: Sequence[dict[str, str]]) -> Text:

@@ -27,13 +27,44 @@ def test_an_eager_message_and_a_rendezvous():
     assert comm.unmatched() == ""
 
 
-def test_messages_of_one_rank_leave_an_overhead_apart():
+def test_eager_messages_of_one_rank_leave_an_overhead_and_their_bytes_apart():
     env, comm = crossbar(4)
     sends = [comm.rank(0).isend(target, 4000.0) for target in (1, 2, 3)]
     receives = [comm.rank(target).irecv() for target in (1, 2, 3)]
     env.run()
-    assert [send.value for send in sends] == [US, 2 * US, 3 * US]
-    assert [receive.value.tick for receive in receives] == [7 * US, 8 * US, 9 * US]
+    assert [send.value for send in sends] == [US, 6 * US, 11 * US]
+    assert [receive.value.tick for receive in receives] == [7 * US, 12 * US, 17 * US]
+
+
+def test_a_message_waits_for_the_adapter_until_a_collective_is_through():
+    env, comm = crossbar(3)
+    comm.rank(0).bcast(4000.0, algorithm="binomial")
+    comm.rank(0).isend(1, 4000.0)
+    receive = Communicator(env, comm.transport, [1, 0]).rank(1).isend(0, 0.0)
+    env.run()
+    # The root sends to rank 2 at 1 us, to rank 1 at 6 us, then this; then on behalf of another communicator.
+    assert receive.value == 16 * US
+
+
+def test_to_receivers_that_come_late_messages_leave_an_overhead_apart():
+    env, comm = crossbar(4, eager=NONE_EAGER)
+    for target in (1, 2, 3):
+        comm.rank(0).isend(target, 4000.0)
+    env.run(until=50 * US)
+    receives = [comm.rank(target).irecv() for target in (3, 1, 2)]
+    env.run()
+    assert [receive.value.tick for receive in receives] == [57 * US, 58 * US, 59 * US]
+
+
+def test_a_message_may_leave_before_one_that_was_sent_earlier_and_has_an_overhead_to_wait():
+    env, comm = crossbar(5, eager=NONE_EAGER, overhead="10 us")
+    for target in (1, 2, 3, 4):
+        comm.rank(0).isend(target, 4000.0)
+    last = comm.rank(4).irecv()  # could be offered at 30 us, and leaves at 40 us
+    env.run(until=20 * US)
+    receives = [comm.rank(target).irecv() for target in (1, 2)]
+    env.run()
+    assert [receive.value.tick for receive in (last, *receives)] == [46 * US, 36 * US, 56 * US]
 
 
 def test_a_message_to_oneself():
@@ -44,15 +75,19 @@ def test_a_message_to_oneself():
     assert [event.value for event in events[2:]] == [Message(1, 0, 10.0, US), Message(1, 0, 11.0, 2 * US)]
 
 
+LARGE_LATER = [{"above": "1 kB", "bandwidth": 1, "latency": 100}]
+"""Messages from 1 kB on have a latency of 200 us, so that smaller ones behind them arrive before them."""
+
+
 def test_a_small_message_does_not_overtake_a_large_one_of_the_same_sender():
     for tag in (None, 5):
-        env, comm = crossbar(2)
+        env, comm = crossbar(2, ranges=LARGE_LATER)
         receives = [comm.rank(1).irecv(0, tag) for _ in range(2)]
-        comm.rank(0).isend(1, 1e6, tag=5)
+        comm.rank(0).isend(1, 1000.0, tag=5)
         comm.rank(0).isend(1, 1.0, tag=5)
         env.run()
-        assert [receive.value.nbytes for receive in receives] == [1e6, 1.0]
-        assert receives[0].value.tick == receives[1].value.tick > 1000 * US
+        assert [receive.value.nbytes for receive in receives] == [1000.0, 1.0]
+        assert receives[0].value.tick == receives[1].value.tick == 202 * US
 
 
 def test_a_rendezvous_waits_for_an_eager_message_before_it():
@@ -65,12 +100,12 @@ def test_a_rendezvous_waits_for_an_eager_message_before_it():
 
 
 def test_one_with_another_tag_may_be_received_first():
-    env, comm = crossbar(2)
+    env, comm = crossbar(2, ranges=LARGE_LATER)
     large, small = comm.rank(1).irecv(0, tag=1), comm.rank(1).irecv(0, tag=2)
-    comm.rank(0).isend(1, 1e6, tag=1)
+    comm.rank(0).isend(1, 1000.0, tag=1)
     comm.rank(0).isend(1, 1.0, tag=2)
     env.run()
-    assert large.value.tick > 1000 * US > small.value.tick
+    assert large.value.tick > 200 * US > small.value.tick
 
 
 def test_a_receive_from_anybody_takes_what_comes_first():

@@ -122,6 +122,18 @@ def test_alpha_and_beta_are_what_a_lone_message_takes(nbytes, factor, share):
     assert tick == pytest.approx((alpha_s + nbytes * beta_s) * TICKS_PER_SECOND, rel=1e-12, abs=2)
 
 
+@check
+@given(st.floats(0.0, 1e5), st.floats(1.0, 100.0), st.floats(0.01, 2.0))
+def test_an_eager_message_keeps_the_adapter_for_its_bytes(nbytes, factor, share):
+    factors = f"{{above: 1 kB, bandwidth: {share}, latency: {factor}}}"
+    text = f"{{flavour: mpich, overhead: 1 us, eager: 50 kB, ranges: [{factors}]}}"
+    _, layer = transport(card(text), node_of=[0, 0, 1])  # the ranges hold for the second pair alone
+    pairs = [(0, 1), (1, 2)]
+    gaps = layer.gap_ticks(*np.array(pairs).T, np.full(2, nbytes))
+    eager_s = [layer.alpha_beta(*pair, nbytes)[1] * nbytes if nbytes <= 5e4 else 0.0 for pair in pairs]
+    assert gaps == pytest.approx(np.array(eager_s) * TICKS_PER_SECOND, rel=1e-12, abs=1)
+
+
 def test_combining_takes_time_by_the_byte():
     _, layer = transport(reduce_bandwidth=4e9)
     assert layer.reduce_seconds(1e6) == 250e-6
@@ -169,6 +181,7 @@ def test_what_a_transport_refuses(options, message):
         ("mpich", "bcast", 10, [("binomial", 122880), ("scatter_ring_allgather", math.inf)]),
         ("mpich", "bcast", 7, [("binomial", math.inf)]),
         ("mpich", "reduce", 8, [("binomial", 2048), ("rabenseifner", math.inf)]),
+        ("mpich", "reduce_scatter", 88, [("recursive_halving", 524287), ("pairwise", math.inf)]),
         ("mpich", "reduce_scatter", 8, [("recursive_halving", 524287), ("pairwise", math.inf)]),
         ("mpich", "gatherv", 8, [("linear", math.inf)]),
         # Open MPI

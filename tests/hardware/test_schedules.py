@@ -331,6 +331,19 @@ def test_rabenseifner_beyond_a_power_of_two_costs_two_messages_more():
     assert cost == pytest.approx(8e-6 + (1400 + 1600) * 1e-9 + (700 + 800) * 1e-10, rel=1e-12)
 
 
+def test_recursive_halving_beyond_a_power_of_two_hands_in_first_and_gets_its_block():
+    # 0 and 2 hand in to 1 and 3; 1, 3, 4, 5 halve six blocks, of which 1 and 3 are after two each.
+    block = 100.0
+    assert by_step(schedule("reduce_scatter", "recursive_halving", 6, 6 * block)) == [
+        [(0, 1, 600.0, 600.0), (2, 3, 600.0, 600.0)],
+        [(1, 4, 200.0, 200.0), (3, 5, 200.0, 200.0), (4, 1, 400.0, 400.0), (5, 3, 400.0, 400.0)],
+        [(1, 3, 200.0, 200.0), (3, 1, 200.0, 200.0), (4, 5, 100.0, 100.0), (5, 4, 100.0, 100.0)],
+        [(1, 0, 100.0, 0.0), (3, 2, 100.0, 0.0)],
+    ]
+    cost = closed_form("reduce_scatter", "recursive_halving", 6, 6 * block, 1e-6, 1e-9, 1e-10)
+    assert cost == pytest.approx(4e-6 + (600 + 400 + 200 + 100) * 1e-9 + (600 + 400 + 200) * 1e-10, rel=1e-12)
+
+
 @every(*ALGORITHMS)
 def test_every_algorithm_has_a_closed_form_and_one_rank_takes_no_time(collective, algorithm, ranks):
     seconds = closed_form(collective, algorithm, ranks, 64.0, 1e-6, 1e-9)
