@@ -280,13 +280,9 @@ class Machine:
             self._hosts[node] = Host(self.env, self.card.host or _NO_HOST)
         return self._hosts[node]
 
-    @property
+    @cached_property
     def topology(self) -> Topology:
         """The links and routes of the nodes in use."""
-        return self._topology
-
-    @cached_property
-    def _topology(self) -> Topology:
         return Topology(self.card, self.nodes)
 
     @property
@@ -297,7 +293,7 @@ class Machine:
     @cached_property
     def network(self) -> Network:
         """The links between the devices, created when something is first sent."""
-        topology = self._topology
+        topology = self.topology
         network = Network(self.env, topology.links, topology.route, nodes=topology.devices, record=self._record)
         now = int(self.env.now)  # the network may come into being in the middle of a disturbance
         for entry in self.card.disturbances:
@@ -433,7 +429,7 @@ class Machine:
             The tick at which the kernel begins; now, unless given.
 
         """
-        fabric = self._topology.fabric(source, reader)
+        fabric = self.topology.fabric(source, reader)
         cap = (fabric.kernel_share if fabric else 1.0) * self.network.bandwidth(source, reader)
         return self.network.transfer(source, reader, nbytes, start=start, cap=cap)
 
@@ -480,7 +476,8 @@ class Machine:
             If the card does not say which MPI there is.
 
         """
-        return Communicator(self.env, self._make_transport(ranks, hosts=hosts))
+        everyone = ranks is None and not hosts
+        return Communicator(self.env, self._transport if everyone else self._make_transport(ranks, hosts=hosts))
 
     @cached_property
     def _transport(self) -> Transport:
