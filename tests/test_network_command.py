@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from simrender.cli import main
 from simrender.hardware.machine import load_machine
 from simrender.hardware.questions import ask_collective, ask_transfer
 from simrender.hardware.schedules import ALGORITHMS, schedule, usable
@@ -364,3 +365,11 @@ def test_machines_that_lack_what_is_asked_for(run_cli, card, gpus):
     assert message(card, "bcast", *alone).endswith("Four nodes has one node, and a message goes between two\n")
     down = "machine.disturbances=[{link: node0.nic.out, share: 0, start: 0 s}]"
     assert "the link node0.nic.out is down" in message(card, "transfer", "--set", down)
+
+
+def test_a_message_between_gpus_owns_up_to_the_slots_it_goes_over(capsys):
+    with pytest.raises(SystemExit):
+        main(["network", "frontera-rtx", "transfer", "--from", "0", "--to", "4", "--bytes", "1MiB", "--json", "-"])
+    paths = {value["path"] for value in json.loads(capsys.readouterr().out)["uncalibrated"]}
+    assert {"machine.pcie.latency", "machine.network.latency", "machine.network.bandwidth"} <= paths
+    assert not any("leaf" in path or "nvlink" in path or "socket" in path for path in paths)

@@ -7,7 +7,6 @@ simulated time of a collective or a message stands the closed form without conte
 
 from __future__ import annotations
 
-import re
 from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
@@ -333,36 +332,13 @@ def _answer(
     )  # fmt: skip
 
 
-_FABRIC: Final = (".bandwidth", ".duplex", ".latency")
-_SECTIONS: Final = (
-    (r"gpu\d+[-+]gpu\d+", ("nvlink.bandwidth", "nvlink.duplex", "nvlink.latency")),
-    (r"switch\d+\.(up|down)", ("pcie.uplink",)),
-    (r"socket\d+-socket\d+", ("pcie.socket_link",)),
-    (r"gpu\d+\.d2h", ("host.from_device", "host.copy_latency")),
-    (r"gpu\d+\.h2d", ("host.to_device", "host.copy_latency")),
-    (r"staging", ("cpu.memory_bandwidth",)),
-    (r"nic\.(in|out)", ("network.bandwidth", "network.latency")),
-    (r"leaf\d+\.(up|down)", ("network.leaf.oversubscription", "network.leaf.latency")),
-)
-"""What stands behind the links of a machine (`simrender.hardware.topology`), by the ends of their names."""
-
-
 def _quantities(
     machine: Machine, pairs: list[tuple[Hashable, Hashable]], *, reduces: bool
 ) -> Iterator[tuple[str, Quantity]]:
     """Yield the quantities of the card that messages between these pairs hang on, in the order of the card."""
     card, topology = machine.card, machine.topology
     links = dict.fromkeys(name for pair in pairs for name in topology.route(*pair) or ())
-    kinds = dict.fromkeys(re.sub(r"\d+(?![a-z])", "0", name) for name in links)
-    lanes = "nvlink" if card.nvlink and card.nvlink.pairs is None else "pcie"
-    fabric = tuple(f"{lanes}{field}" for field in _FABRIC)
-    used = [
-        path
-        for kind in kinds
-        for pattern, paths in ((r"gpu\d+\.(in|out|port)", fabric), *_SECTIONS)
-        if re.search(rf"(^|\.){pattern}$", kind)
-        for path in paths
-    ]
+    used = [path for link in links for path in topology.sources(link)]
     if any(topology.staged(*pair) for pair in pairs):
         used.append("network.staging_block")
     if reduces:

@@ -10,8 +10,9 @@ The devices that messages go between are the processors, numbered through all no
 
 from __future__ import annotations
 
+import re
 from collections.abc import Hashable, Iterator
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -149,6 +150,27 @@ class InterconnectCard(Card):
     staging_block: Size | None = None
 
 
+_SOURCES: Final = {
+    "gpu-gpu": ("nvlink.bandwidth", "nvlink.duplex", "nvlink.latency"),
+    "gpu+gpu": ("nvlink.bandwidth", "nvlink.duplex", "nvlink.latency"),
+    "switch.up": ("pcie.uplink",),
+    "switch.down": ("pcie.uplink",),
+    "socket-socket": ("pcie.socket_link",),
+    "gpu.d2h": ("host.from_device", "host.copy_latency"),
+    "gpu.h2d": ("host.to_device", "host.copy_latency"),
+    "memory": ("cpu.memory_bandwidth",),
+    "staging": ("cpu.memory_bandwidth",),
+    "nic.out": ("network.bandwidth", "network.latency"),
+    "nic.in": ("network.bandwidth", "network.latency"),
+    "leaf.up": ("network.leaf.oversubscription", "network.leaf.latency"),
+    "leaf.down": ("network.leaf.oversubscription", "network.leaf.latency"),
+    "storage": ("storage.shared.server_bandwidth",),
+    "client": ("storage.shared.client_bandwidth",),
+    "disk": ("storage.local.bandwidth",),
+}
+"""What links hang on, by their names without numbers."""
+
+
 def _group_of(groups: Groups | None, member: int) -> int | None:
     return next((g for g, group in enumerate(groups or []) if member in group), None)
 
@@ -272,6 +294,20 @@ class Topology:
             uplink = Link(leaf.nodes * network.bandwidth / leaf.oversubscription, 0.5 * leaf.latency)
             for i in range(-(-self.nodes // leaf.nodes)):
                 self.links[f"leaf{i}.up"] = self.links[f"leaf{i}.down"] = uplink
+
+    def sources(self, link: str) -> tuple[str, ...]:
+        """Return the paths of the values on the card that a link's bandwidth and latency hang on."""
+        name = re.sub(r"^node\d+\.", "", link)
+        name = re.sub(r"(?<=[a-z])\d+(?![a-z])", "", name)  # d2h keeps its own
+        card, host = self.card, self.card.host
+        if name in {"gpu.out", "gpu.in", "gpu.port"}:
+            lanes = "pcie" if card.pcie else "nvlink"
+            return f"{lanes}.bandwidth", f"{lanes}.duplex", f"{lanes}.latency"
+        if name in {"gpu.slot.up", "gpu.slot.down"}:
+            way = "from_device" if name == "gpu.slot.up" else "to_device"
+            wider = getattr(host, way) is not None and getattr(host, way) > card.pcie.bandwidth
+            return f"host.{way}" if wider else "pcie.bandwidth", "pcie.latency"
+        return _SOURCES[name]
 
     # -- routes ---------------------------------------------------------------------------------------------------
 

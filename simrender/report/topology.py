@@ -127,7 +127,7 @@ def _add_processors(graph: Graph[str], topology: Topology) -> None:
                 _node(graph, name, "switch", f"PCIe switch {switch}")
                 _both(graph, topology, name, above, f"{p}{name}.up", f"{p}{name}.down")
             above = name
-        _both(graph, topology, f"gpu{gpu}", above, f"{p}gpu{gpu}.out", f"{p}gpu{gpu}.in")
+        _both(graph, topology, f"gpu{gpu}", above, f"{p}gpu{gpu}.slot.up", f"{p}gpu{gpu}.slot.down")
 
 
 def _add_ways_to_host(graph: Graph[str], topology: Topology) -> None:

@@ -102,6 +102,15 @@ def test_there_is_no_link_that_nothing_goes_over(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_every_link_hangs_on_values_of_the_card(name):
+    card = load(name)
+    paths = {path for path, _ in card.quantities()}
+    topology = Topology(card, min(card.nodes, MOST_NODES))
+    for link in topology.links:
+        assert set(topology.sources(link)) <= paths, link
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_there_and_back_take_as_long(name):
     card = load(name)
     topology = Topology(card, min(card.nodes, MOST_NODES))
