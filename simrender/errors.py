@@ -57,6 +57,10 @@ class SceneError(SimrenderError):
     """A mesh file or scene that cannot be read or rendered."""
 
 
+class SceneWarning(UserWarning):
+    """A scene that was repaired, or that lies outside the range where its rays are exact."""
+
+
 class UsageError(SimrenderError):
     """Options that contradict each other, the chosen machine, or the file system."""
 

@@ -1,4 +1,4 @@
-"""Scenes of triangle meshes with instances.
+"""Scenes: triangle meshes with instances, a volume, or both.
 
 As in PBRT and in the ray queue cycling paper (section 4.1), a scene is a list of instances of *objects*; an object is
 one or more triangle *meshes*, and a mesh has one *material*. A triangle's global id counts through the instances in
@@ -11,11 +11,16 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from simrender.errors import SceneError
+
+if TYPE_CHECKING:
+    from simrender.rays.elements import Elements
+    from simrender.rays.volume import Volume
 
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
@@ -52,11 +57,14 @@ class PointLight:
     position : (x, y, z)
     intensity : (r, g, b)
         Radiant intensity in power per steradian: the irradiance at distance d is intensity / d^2.
+    falloff : bool
+        False for a light that is equally bright at every distance, as SpRay's are.
 
     """
 
     position: tuple[float, float, float]
     intensity: tuple[float, float, float]
+    falloff: bool = True
 
 
 @dataclass(frozen=True)
@@ -89,6 +97,11 @@ class Mesh:
         Indices into ``vertices``.
     material : int
         Index into the scene's materials.
+    colors : float32 array (n, 3), optional
+        Of the vertices, 0 to 1; they take the place of the material's albedo.
+    smooth : bool
+        Shade with vertex normals, the means of the normals of the faces around each vertex by their areas, and not with
+        the faces' own.
 
     Raises
     ------
@@ -100,6 +113,8 @@ class Mesh:
     vertices: F32
     faces: I32
     material: int = 0
+    colors: F32 | None = None
+    smooth: bool = False
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float32)
@@ -117,6 +132,11 @@ class Mesh:
             where = f"the first is face {outside[0]}: {indices[outside[0]].tolist()}"
             faces = f"{len(outside)} face points" if len(outside) == 1 else f"{len(outside)} faces point"
             raise SceneError(f"{faces} outside the {len(vertices)} vertices; {where}")
+        if self.colors is not None:
+            colors = np.ascontiguousarray(self.colors, dtype=np.float32)
+            if colors.shape != vertices.shape:
+                raise SceneError(f"{len(vertices)} vertices need colors of the same shape, got {colors.shape}")
+            object.__setattr__(self, "colors", colors)
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", np.ascontiguousarray(indices, dtype=np.int32))
 
@@ -167,6 +187,12 @@ class Scene:
     materials : tuple of Material
     points : tuple of PointLight
     environment : Environment
+    hemispheres : tuple of (r, g, b)
+        Radiance of the diffuse lights, which shine from everywhere above a surface, as SpRay's do.
+    volume : Volume, optional
+        A structured volume; such a scene needs no instances.
+    elements : Elements, optional
+        An unstructured volume; such a scene needs no instances.
 
     Raises
     ------
@@ -181,15 +207,20 @@ class Scene:
     materials: tuple[Material, ...] = (Material(),)
     points: tuple[PointLight, ...] = ()
     environment: Environment = field(default_factory=Environment)
+    hemispheres: tuple[tuple[float, float, float], ...] = ()
+    volume: Volume | None = None
+    elements: Elements | None = None
 
     def __post_init__(self) -> None:
         of = np.ascontiguousarray(self.instance_object, dtype=np.int32)
         transform = np.ascontiguousarray(self.instance_transform, dtype=np.float32)
-        if len(of) == 0:
+        if len(of) == 0 and (self.volume is not None or self.elements is not None):
+            transform = transform.reshape(0, 3, 4)
+        elif len(of) == 0:
             raise SceneError("the scene is empty: it has no instances")
         if transform.shape != (len(of), 3, 4):
             raise SceneError(f"{len(of)} instances need transforms of shape ({len(of)}, 3, 4), got {transform.shape}")
-        if of.min() < 0 or of.max() >= len(self.objects):
+        if len(of) and (of.min() < 0 or of.max() >= len(self.objects)):
             raise SceneError(f"an instance points to object {of.max()}, but there are {len(self.objects)} objects")
         if not np.isfinite(transform).all():
             raise SceneError("an instance has a transform that is not finite")
@@ -236,10 +267,8 @@ class Scene:
         vertices = np.zeros((first_vertex[-1], 3), np.float32)
         faces = np.zeros((first_face[-1], 3), np.int32)
         mesh_of = np.zeros(first_face[-1], np.int32)
-        for index, thing in enumerate(self.objects):
-            instances = np.flatnonzero(self.instance_object == index)
-            if len(instances) == 0:
-                continue
+        for index, instances in self._placed:
+            thing = self.objects[index]
             shift = _starts(np.array([len(m.vertices) for m in thing.meshes]))
             local = np.concatenate([m.vertices for m in thing.meshes])
             corners = np.concatenate([m.faces + s for m, s in zip(thing.meshes, shift[:-1], strict=True)])
@@ -253,24 +282,78 @@ class Scene:
             mesh_of[rows] = np.tile(ids + first_mesh[index], len(instances))
         return Triangles(vertices, faces, mesh_of)
 
+    @property
+    def _placed(self) -> list[tuple[int, NDArray[np.int64]]]:
+        """The objects that have instances, each with these."""
+        rows = [(index, np.flatnonzero(self.instance_object == index)) for index in range(len(self.objects))]
+        return [(index, instances) for index, instances in rows if len(instances)]
+
+    def vertex_normals(self) -> F32:
+        """Return a unit normal for each vertex of `triangles`, float32 (v, 3); zero where the mesh is not smooth.
+
+        The array has no rows if no mesh is smooth.
+        """
+        if not any(mesh.smooth for mesh in self.meshes):
+            return np.zeros((0, 3), np.float32)
+        parts: dict[int, F32] = {}
+        for index, instances in self._placed:
+            local = np.concatenate([_normals(mesh) for mesh in self.objects[index].meshes])
+            inverse = np.linalg.pinv(self.instance_transform[instances, :, :3].astype(np.float64))
+            world = np.einsum("nji,vj->nvi", inverse, local)  # normals turn by the inverse transpose
+            length = np.linalg.norm(world, axis=-1, keepdims=True)
+            world = (world / np.where(length > 0.0, length, 1.0)).astype(np.float32)
+            parts.update(zip(instances.tolist(), world, strict=True))
+        return np.concatenate([parts[i] for i in range(len(self.instance_object))])
+
+    def vertex_colors(self) -> F32:
+        """Return a color for each vertex of `triangles`, float32 (v, 3); negative where the mesh has none.
+
+        The array has no rows if no mesh has colors.
+        """
+        if all(mesh.colors is None for mesh in self.meshes):
+            return np.zeros((0, 3), np.float32)
+        of_object = [
+            np.concatenate([np.full_like(m.vertices, -1.0) if m.colors is None else m.colors for m in thing.meshes])
+            for thing in self.objects
+        ]
+        return np.concatenate([of_object[index] for index in self.instance_object])
+
     @cached_property
     def bounds(self) -> tuple[F32, F32]:
-        """Lowest and highest corner of a box around the boxes of all instances, without writing them out."""
-        low = np.array([np.min([m.vertices.min(axis=0) for m in o.meshes], axis=0) for o in self.objects])
-        high = np.array([np.max([m.vertices.max(axis=0) for m in o.meshes], axis=0) for o in self.objects])
-        matrix, of = self.instance_transform, self.instance_object
-        centre, half = 0.5 * (low + high)[of], 0.5 * (high - low)[of]
-        centre = np.einsum("nij,nj->ni", matrix[:, :, :3], centre) + matrix[:, :, 3]
-        half = np.einsum("nij,nj->ni", np.abs(matrix[:, :, :3]), half)
-        return (centre - half).min(axis=0).astype(np.float32), (centre + half).max(axis=0).astype(np.float32)
+        """Lowest and highest corner of a box around everything; instances are not written out for it."""
+        lows, highs = [np.full(3, np.inf)], [np.full(3, -np.inf)]
+        for volume in (self.volume, self.elements):
+            if volume is not None:
+                lows.append(volume.bounds[0])
+                highs.append(volume.bounds[1])
+        if len(self.instance_object):
+            low = np.array([np.min([m.vertices.min(axis=0) for m in o.meshes], axis=0) for o in self.objects])
+            high = np.array([np.max([m.vertices.max(axis=0) for m in o.meshes], axis=0) for o in self.objects])
+            matrix, of = self.instance_transform, self.instance_object
+            centre, half = 0.5 * (low + high)[of], 0.5 * (high - low)[of]
+            centre = np.einsum("nij,nj->ni", matrix[:, :, :3], centre) + matrix[:, :, 3]
+            half = np.einsum("nij,nj->ni", np.abs(matrix[:, :, :3]), half)
+            lows.append((centre - half).min(axis=0))
+            highs.append((centre + half).max(axis=0))
+        return np.min(lows, axis=0).astype(np.float32), np.max(highs, axis=0).astype(np.float32)
 
     def scaled(self, factor: float) -> Scene:
         """Return the scene in other units of length: every length times a factor, radiance as it is."""
         points = tuple(
-            PointLight(tuple(x * factor for x in p.position), tuple(i * factor**2 for i in p.intensity))  # type: ignore[arg-type]
+            replace(
+                p,
+                position=tuple(x * factor for x in p.position),
+                intensity=tuple(i * factor**2 for i in p.intensity) if p.falloff else p.intensity,
+            )
             for p in self.points
         )
-        return replace(self, instance_transform=self.instance_transform * np.float32(factor), points=points)
+        return replace(
+            self,
+            instance_transform=self.instance_transform * np.float32(factor),
+            points=points,
+            volume=self.volume and self.volume.scaled(factor),
+            elements=self.elements and self.elements.scaled(factor),
+        )
 
     @cached_property
     def key(self) -> str:
@@ -282,10 +365,30 @@ class Scene:
                 digest.update(f"mesh {mesh.vertices.shape} {mesh.faces.shape} {mesh.material}".encode())
                 digest.update(mesh.vertices.data)
                 digest.update(mesh.faces.data)
+                if mesh.smooth:
+                    digest.update(b"smooth")
+                if mesh.colors is not None:
+                    digest.update(mesh.colors.data)
         digest.update(self.instance_object.data)
         digest.update(self.instance_transform.data)
-        digest.update(repr((self.materials, self.points, self.environment)).encode())
+        digest.update(repr((self.materials, self.points, self.environment, self.hemispheres)).encode())
+        for volume in (self.volume, self.elements):
+            if volume is not None:
+                digest.update(volume.key.encode())
         return digest.hexdigest()
+
+
+def _normals(mesh: Mesh) -> NDArray[np.float64]:
+    """Return the area-weighted mean normal of each vertex, not normalized; zeros if the mesh is not smooth."""
+    vertices = mesh.vertices.astype(np.float64)
+    if not mesh.smooth:
+        return np.zeros_like(vertices)
+    a, b, c = (vertices[mesh.faces[:, corner]] for corner in range(3))
+    normal = np.cross(b - a, c - a)
+    count = len(vertices)
+    return np.stack(
+        [sum(np.bincount(mesh.faces[:, k], normal[:, axis], minlength=count) for k in range(3)) for axis in range(3)], 1
+    )
 
 
 def _starts(counts: NDArray[np.int64]) -> NDArray[np.int64]:
