@@ -31,7 +31,7 @@ CARD_ENDINGS: Final = (".yaml", ".yml", "")
 
 _SECTIONS: Final[dict[Kind, tuple[str, ...]]] = {
     "machine": ("nodes", "gpus", "gpu", "cpu", "host", "nvlink", "pcie", "network"),
-    "workload": ("published", "traced", "scene", "camera", "bounces", "policy"),
+    "workload": ("published", "traced", "scene", "camera", "bounces", "integrator", "domains", "policy"),
 }
 """Fields by which the card of a machine is told from that of a workload."""
 

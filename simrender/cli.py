@@ -22,6 +22,11 @@ from simrender.errors import SimrenderError, UnitError, UsageError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from simrender.rays.crossings import Crossings
+    from simrender.rays.estimate import Estimate
+    from simrender.rays.trace import Trace
+    from simrender.rays.workload import Workload
+    from simrender.rays.workload_card import DomainsCard
     from simrender.result import Result
 
 app = App(
@@ -40,8 +45,8 @@ def _whole(_type: Any, tokens: Sequence[Token]) -> int:
     return int(text)
 
 
-MOST_DOMAINS = 1024
-"""Rows that `simrender trace --domains` will print."""
+MOST_REPLICAS = 1000
+"""Traces from which `simrender trace` will estimate an error."""
 
 _MOST_BYTES = 1e12
 """Of a message or vector that `simrender network` is asked for; what takes months has no place in 64-bit ticks."""
@@ -128,10 +133,16 @@ def trace(
     workload: str,
     /,
     *,
-    domains: Whole = 8,
+    resolution: str | None = None,
+    domains: str | None = None,
+    partition: Literal["given", "kd_bricks", "sah", "grid", "balanced", "objects"] | None = None,
+    replicas: Whole | None = None,
     set_: Set = (),
     seed: Whole = 1,
     image: Flag = None,
+    show: Literal["domains", "work", "error"] | None = None,
+    ranks: Whole | None = None,
+    json: Annotated[str | None, Parameter(negative="")] = None,
     cache: Flag = None,
 ) -> None:
     """Trace a workload's rays for real, keep them in the cache, and compare with raw embreex on the same rays.
@@ -139,43 +150,163 @@ def trace(
     Parameters
     ----------
     workload
-        Name or path of a card, or path of a mesh file.
+        Name or path of a card, or path of a file that holds a mesh, a SpRay scene or a volume.
+    resolution
+        Trace so many pixels, WIDTHxHEIGHT; by default the card's traced.resolution.
     domains
-        Say what would lie in each domain of an object partition into so many.
+        How many domains, or the shape of a grid, such as 12x10x6; by default as the card says, else 8.
+    partition
+        How the scene is cut into domains; see `simrender show` of a workload for its own.
+    replicas
+        Estimate the error of tracing a part of the rays from so many independent traces.
     set_
         Change a value of the card: PATH=VALUE, where PATH starts with workload.
     seed
         Of all random numbers.
     image
         Write the picture (.png).
+    show
+        Write another picture: false colour by domain, the work of each pixel, or the error of each pixel.
+    ranks
+        With --show domains: paint by the ranks that would own the domains, blocks in Morton order.
+    json
+        Write the answer as JSON to a file, or to stdout (-).
     cache
         Folder of the trace cache.
 
     """
     from simrender.cards import split_assignments
+    from simrender.catalog import CARD_ENDINGS
     from simrender.rays.workload import load_workload
-    from simrender.report.files import check_target, write_image
-    from simrender.report.tracing import describe_domains, describe_rays, describe_speed
+    from simrender.report import tracing as report
+    from simrender.report.files import check_target, write_image, write_json
 
     if image:
         check_target("--image", image, (".png",))
-    if not 1 <= domains <= MOST_DOMAINS:
-        raise UsageError(f"--domains {domains}: expected 1 to {MOST_DOMAINS}")
-    sections = split_assignments(set_, ("workload",))
+    if json is not None and json != "-":
+        check_target("--json", Path(json), (".json",))
+    if show and not image:
+        raise UsageError(f"--show {show} says what --image shows; give --image FILE.png too")
+    if ranks is not None and show != "domains":
+        raise UsageError(f"--ranks {ranks} goes with --show domains")
+    if replicas is not None and not 2 <= replicas <= MOST_REPLICAS:
+        raise UsageError(f"--replicas {replicas}: expected 2 to {MOST_REPLICAS}")
+    overrides = list(split_assignments(set_, ("workload",))["workload"])
+    if resolution is not None:
+        width, height = _resolution(resolution)
+        overrides.append(f"traced.resolution={width}x{height}")
+        if Path(workload).suffix.lower() not in CARD_ENDINGS and Path(workload).is_file():
+            overrides.append(f"published.resolution={width}x{height}")  # a bare file publishes nothing
     begin = time.perf_counter()
-    loaded = load_workload(workload, sections["workload"], cache)
+    loaded = load_workload(workload, overrides, cache)
+    cut = _domains_card(loaded.card.domains, partition, domains)
     rays = loaded.trace(seed)
     with _Progress() as progress:
         rays.progress = progress
         rays.complete()
-    console = _console()
-    console.print(describe_rays(loaded.name, rays))
-    console.print(describe_domains(loaded, rays, domains))
-    console.print(describe_speed(rays, progress.seconds, time.perf_counter))
+    crossings = loaded.domain_crossings(seed, loaded.domains(cut))
+    crossings.table(0)
+    crossings.save()
+    estimates, picture = _replicate(loaded, crossings, seed, replicas or (4 if show == "error" else 0))
+    if json == "-":
+        _print_json(report.trace_dict(loaded, rays, crossings) | _estimates_dict(estimates))
+    else:
+        console = _console()
+        console.print(report.describe_rays(loaded.name, rays))
+        console.print(report.describe_domains(rays, crossings))
+        if estimates:
+            console.print(report.describe_estimates(estimates))
+        console.print(report.describe_speed(rays, progress.seconds, time.perf_counter))
+        if json:
+            write_json(Path(json), report.trace_dict(loaded, rays, crossings) | _estimates_dict(estimates))
+            _note(f"wrote {json}")
     if image:
-        write_image(image, rays.image())
+        if show is None:
+            write_image(image, rays.image())
+        else:
+            _write_picture(image, show, loaded.name, rays, crossings, ranks, picture)
         _note(f"wrote {image} ({rays.size[0]}x{rays.size[1]})")
     _note(f"done in {time.perf_counter() - begin:.2f} s")
+
+
+def _domains_card(card: DomainsCard | None, partition: str | None, domains: str | None) -> DomainsCard | None:
+    """Return how the scene is to be cut, from the options; None leaves it to the card."""
+    from pydantic import ValidationError
+
+    from simrender.rays.workload_card import DomainsCard
+
+    if partition is None and domains is None:
+        return None
+    fields: dict[str, Any] = {}
+    if domains is not None:
+        parts = domains.split("x")
+        if len(parts) not in {1, 3} or not all(re.fullmatch("[1-9][0-9]{0,4}", part) for part in parts):
+            raise UsageError(f"--domains {domains}: expected how many, or the shape of a grid such as 12x10x6")
+        fields = {"count": int(parts[0])} if len(parts) == 1 else {"shape": tuple(int(part) for part in parts)}
+    if partition is not None:
+        fields["method"] = partition
+    elif "shape" in fields:
+        fields["method"] = "grid"
+    elif card is not None and card.method in {"kd_bricks", "sah", "objects"}:
+        fields["method"] = card.method
+    else:
+        fields["method"] = "auto"
+    try:
+        return DomainsCard(**fields)
+    except ValidationError as error:
+        words = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
+        given = " ".join(f"--{name} {value}" for name, value in (("partition", partition), ("domains", domains)) if value)
+        raise UsageError(f"{given}: {words} (count and shape are given by --domains)") from None
+
+
+def _replicate(
+    workload: Workload, crossings: Crossings, seed: int, replicas: int
+) -> tuple[dict[str, Estimate], Estimate | None]:
+    """Trace independent replicas, and estimate the error of what is counted and of the image."""
+    if not replicas:
+        return {}, None
+    from simrender.rays.estimate import estimate, seeds
+    from simrender.report.tracing import replica_counts
+
+    counted, images = [], []
+    for s in seeds(seed, replicas):
+        rays = workload.trace(s)
+        with _Progress() as progress:
+            rays.progress = progress
+            rays.complete()
+        counted.append(replica_counts(workload, rays, workload.domain_crossings(s, crossings.domains)))
+        images.append(rays.image())
+    names = list(counted[0])
+    return {name: estimate([counts[name] for counts in counted]) for name in names}, estimate(images)
+
+
+def _estimates_dict(estimates: dict[str, Estimate]) -> dict[str, Any]:
+    return {"estimates": {name: found.to_dict() for name, found in estimates.items()}} if estimates else {}
+
+
+def _write_picture(
+    path: Path, show: str, name: str, rays: Trace, crossings: Crossings, ranks: int | None, picture: Estimate | None
+) -> None:
+    from simrender.report import pictures
+    from simrender.report.files import write_figure, write_image
+
+    if show == "domains":
+        group = None
+        if ranks is not None:
+            from simrender.rays.domains import morton_ranks
+
+            group = morton_ranks(crossings.domains.low, crossings.domains.high, ranks)
+        write_image(path, pictures.domain_picture(rays, crossings, group))
+    elif show == "work":
+        write_figure(path, pictures.plot_work(name, rays))
+    elif picture is not None:
+        write_figure(path, pictures.plot_error(name, picture))
+
+
+def _print_json(value: Any) -> None:
+    import json as encoder
+
+    print(encoder.dumps(value, indent=1))  # noqa: T201 - the answer itself
 
 
 @app.command
@@ -382,9 +513,7 @@ def network(
         shown = report.describe_network(machine, card, answers, given=given)
     seconds = time.perf_counter() - begin
     if json == "-":
-        import json as encoder
-
-        print(encoder.dumps(value, indent=1))  # noqa: T201 - the answer itself
+        _print_json(value)
     else:
         _console().print(shown)
         if json:
@@ -397,9 +526,7 @@ def network(
 
 def _publish(result: Result, json: str | None) -> None:
     if json == "-":
-        import json as encoder
-
-        print(encoder.dumps(result.to_dict(), indent=1))  # noqa: T201 - the result itself
+        _print_json(result.to_dict())
         return
     from simrender.report.answer import answer
 

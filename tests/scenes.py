@@ -8,7 +8,8 @@ import numpy as np
 
 from simrender.cards import Document
 from simrender.rays.scene import IDENTITY, Environment, Material, Mesh, PointLight, Scene, SceneObject
-from simrender.rays.workload import Workload, WorkloadCard
+from simrender.rays.workload import Workload
+from simrender.rays.workload_card import WorkloadCard
 
 WHITE, MIRROR, LAMP = 0, 1, 2
 MATERIALS = (Material((0.75, 0.75, 0.75)), Material((0.9, 0.9, 0.9), mirror=0.8), Material(emission=(8.0, 7.0, 5.0)))

@@ -3,7 +3,8 @@ import pytest
 from simrender.cards import Card, Count, Document, Quantity, Size, split_assignments, written
 from simrender.errors import CardError, UsageError
 from simrender.hardware.machine import MachineCard, load_machine
-from simrender.rays.workload import WorkloadCard, load_workload
+from simrender.rays.workload import load_workload
+from simrender.rays.workload_card import WorkloadCard
 
 MACHINE = """\
 title: Two GPUs

@@ -8,5 +8,6 @@ CAMERA: Final = 0
 DIFFUSE: Final = 1
 MIRROR: Final = 2
 SHADOW: Final = 3
+SCATTER: Final = 4
 
-KINDS: Final = ("camera", "diffuse", "mirror", "shadow")
+KINDS: Final = ("camera", "diffuse", "mirror", "shadow", "scatter")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,11 @@ FORMATS = (".ply", ".obj", ".glb", ".gltf", ".stl")
 
 _PARTS = 64
 """A scanned mesh has no objects to deal to GPUs, so it is cut into this many meshes, in the order of its faces."""
+
+_GAMMA = 2.2
+"""Colors in mesh files are meant for a display; scenes hold reflectances."""
+
+_DAMAGED = "cannot read this mesh, which is damaged or cut short"
 
 _Y_UP = (".obj", ".glb", ".gltf")
 
@@ -34,6 +41,40 @@ def read_scene(path: Path) -> Scene:
         If the file is missing, unreadable, or holds a mesh that cannot be rendered; the message names the file.
 
     """
+    loaded = _loaded(path)
+    import trimesh
+
+    try:
+        with np.errstate(over="ignore"):
+            return _from_graph(loaded) if isinstance(loaded, trimesh.Scene) else _from_mesh(loaded, path)
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from None
+
+
+def read_mesh(path: Path) -> Mesh:
+    """Read a mesh file that holds one mesh, with the vertex colors that it may have.
+
+    Parameters
+    ----------
+    path : Path
+        A file of one of the `FORMATS`.
+
+    Raises
+    ------
+    SceneError
+        As `read_scene`, and if the file holds a scene of several meshes.
+
+    """
+    loaded = _loaded(path)
+    try:
+        with np.errstate(over="ignore"):
+            return _one_mesh(loaded)
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from None
+
+
+def _loaded(path: Path) -> Any:
+    """Return what trimesh makes of a file."""
     if path.suffix.lower() not in FORMATS:
         raise SceneError(f"{path}: unknown mesh format {path.suffix!r} (known: {', '.join(FORMATS)})")
     if not path.is_file():
@@ -42,25 +83,34 @@ def read_scene(path: Path) -> Scene:
         raise SceneError(f"{path}: the file is empty")
     import trimesh
 
+    fault = _ply_fault(path) if path.suffix.lower() == ".ply" else ""
+    if fault:
+        raise SceneError(f"{path}: {_DAMAGED}: {fault}")
     try:
         with np.errstate(over="ignore"):  # a vertex too far for float32 is refused as infinite
-            loaded: Any = trimesh.load(path, process=False)
+            return trimesh.load(path, process=False)
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise SceneError(f"{path}: cannot read this mesh, which is damaged or cut short: {reason}") from None
-    try:
-        with np.errstate(over="ignore"):
-            return _from_graph(loaded) if isinstance(loaded, trimesh.Scene) else _from_mesh(loaded, path)
-    except SceneError as error:
-        raise SceneError(f"{path}: {error}") from None
+        raise SceneError(f"{path}: {_DAMAGED}: {reason}") from None
 
 
-def _from_mesh(loaded: Any, path: Path) -> Scene:
+def _one_mesh(loaded: Any) -> Mesh:
     _check_length(getattr(loaded, "metadata", {}).get("_ply_raw", {}))
+    if getattr(loaded, "geometry", None):
+        raise SceneError(f"it holds a scene of {len(loaded.geometry)} meshes, expected one mesh")
     faces = getattr(loaded, "faces", None)
     if faces is None or len(faces) == 0:
         raise SceneError("the mesh is empty: it has no triangles")
-    mesh = Mesh(np.asarray(loaded.vertices), np.asarray(faces))
+    colors = None
+    if loaded.visual.kind == "vertex":
+        colors = np.asarray(loaded.visual.vertex_colors)[:, :3].astype(np.float32) / np.float32(255.0)
+    return Mesh(np.asarray(loaded.vertices), np.asarray(faces), colors=colors)
+
+
+def _from_mesh(loaded: Any, path: Path) -> Scene:
+    mesh = _one_mesh(loaded)
+    if mesh.colors is not None:
+        mesh = replace(mesh, colors=mesh.colors ** np.float32(_GAMMA))
     thing = SceneObject(path.stem, _cut(mesh, _PARTS))
     return _lit((thing,), np.zeros(1, np.int32), IDENTITY[None], (_material(loaded),), path.suffix.lower() in _Y_UP)
 
@@ -73,6 +123,86 @@ def _check_length(elements: Any) -> None:
         found = min((len(column) for column in columns), default=0)
         if found < announced:
             raise SceneError(f"the file is cut short: it announces {announced} of element {what} and has {found}")
+
+
+_PLY_BYTES = {
+    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
+    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
+    **dict.fromkeys(("int", "uint", "int32", "uint32", "float", "float32"), 4),
+    **dict.fromkeys(("double", "float64"), 8),
+}
+_HEADER_LIMIT = 1 << 20
+
+
+def _ply_fault(path: Path) -> str:
+    """Return what is wrong with the rows of a PLY file, and in which line or byte; nothing if they look whole.
+
+    A text file without its last rows passes: `_check_length` says how many of which element it lacks.
+    """
+    with path.open("rb") as file:
+        head = file.read(_HEADER_LIMIT)
+    if head.split(None, 1)[:1] != [b"ply"]:
+        return "it does not begin with the line 'ply'"
+    end = re.search(rb"^end_header[ \t]*(\r\n|\n|\r)", head, re.MULTILINE)
+    if end is None:
+        return f"its header, {len(head)} bytes long, does not end with a line 'end_header'"
+    lines = head[: end.start()].decode("ascii", "replace").splitlines()
+    form, elements = "", []
+    for words in (line.split() for line in lines):
+        if words[:1] == ["format"] and len(words) > 1:
+            form = words[1]
+        elif words[:1] == ["element"] and len(words) == 3 and words[2].isdecimal():
+            elements.append((words[1], int(words[2]), list[tuple[str, ...]]()))
+        elif words[:1] == ["property"] and elements and len(words) == (5 if words[1:2] == ["list"] else 3):
+            elements[-1][2].append(tuple(words[1:-1]))
+    if form == "ascii":
+        return _text_fault(path, len(lines) + 1, elements)
+    known = all(kind in _PLY_BYTES for _, _, row in elements for p in row for kind in (p[1:] if p[0] == "list" else p))
+    order = {"binary_little_endian": "little", "binary_big_endian": "big"}.get(form)
+    return _binary_fault(path, end.end(), elements, order) if known and order else ""
+
+
+def _text_fault(path: Path, header: int, elements: Any) -> str:
+    """Find the first row of a text file that has fewer numbers than its element."""
+    with path.open(encoding="ascii", errors="replace") as file:
+        rows = ((at, line.split()) for at, line in enumerate(file, start=1) if at > header and not line.isspace())
+        for name, count, properties in elements:
+            for row in range(count):
+                at, words = next(rows, (0, []))
+                if not words:
+                    return ""
+                need = 0
+                for kind in properties:
+                    many = words[need] if kind[0] == "list" and need < len(words) else "0"
+                    need += 1 + (int(many) if many.isdecimal() else 0)
+                if len(words) < need:
+                    return f"line {at} has {len(words)} of the {need} numbers of {name} {row} of {count}"
+    return ""
+
+
+def _binary_fault(path: Path, start: int, elements: Any, order: Any) -> str:
+    """Find the row in which a binary file ends too early, if it does."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        file.seek(start)
+        for name, count, properties in elements:
+            first, row = file.tell(), 0
+            for row in range(count):
+                for kind in properties:
+                    many = 1
+                    if kind[0] == "list":
+                        many = int.from_bytes(file.read(_PLY_BYTES[kind[1]]), order)
+                    file.seek(many * _PLY_BYTES[kind[-1]], 1)
+                if file.tell() > size:
+                    return f"it ends at byte {size}, in {name} {row} of {count}"
+                # Rows are nearly always of one length; only where that cannot be so is each one looked at.
+                if row == 0 and first + count * (file.tell() - first) <= size:
+                    file.seek(first + count * (file.tell() - first))
+                    break
+            if row > 0:
+                return f"not all of its {name}s have the same number of corners: write them as triangles"
+        end = file.tell()
+    return "" if end == size else f"it has {size} bytes, but rows like the first of each element take {end}"
 
 
 def _from_graph(graph: Any) -> Scene:
@@ -103,12 +233,13 @@ def _from_graph(graph: Any) -> Scene:
 def _cut(mesh: Mesh, parts: int) -> tuple[Mesh, ...]:
     """Cut a mesh into so many parts of about equally many consecutive faces."""
     pieces = np.array_split(mesh.faces, parts)
-    return tuple(Mesh(*_compact(mesh, piece), mesh.material) for piece in pieces if len(piece))
+    return tuple(_part(mesh, piece) for piece in pieces if len(piece))
 
 
-def _compact(mesh: Mesh, faces: Any) -> tuple[Any, Any]:
+def _part(mesh: Mesh, faces: Any) -> Mesh:
     used, renumbered = np.unique(faces, return_inverse=True)
-    return mesh.vertices[used], renumbered.reshape(-1, 3)
+    colors = None if mesh.colors is None else mesh.colors[used]
+    return replace(mesh, vertices=mesh.vertices[used], faces=renumbered.reshape(-1, 3).astype(np.int32), colors=colors)
 
 
 def _material(geometry: Any) -> Material:
@@ -116,7 +247,7 @@ def _material(geometry: Any) -> Material:
     if color is None:
         return Material((0.72, 0.68, 0.62))
     red, green, blue = (float(c) / 255.0 for c in color[:3])
-    return Material((red**2.2, green**2.2, blue**2.2))
+    return Material((red**_GAMMA, green**_GAMMA, blue**_GAMMA))
 
 
 def _lit(objects: Any, owner: Any, transforms: Any, materials: Any, y_up: bool) -> Scene:

@@ -100,8 +100,7 @@ class Mesh:
     colors : float32 array (n, 3), optional
         Of the vertices, 0 to 1; they take the place of the material's albedo.
     smooth : bool
-        Shade with vertex normals, the means of the normals of the faces around each vertex by their areas, and not with
-        the faces' own.
+        Shade with normals mixed from those of the vertices, and not with the faces' own; see `Scene.vertex_normals`.
 
     Raises
     ------
@@ -289,9 +288,10 @@ class Scene:
         return [(index, instances) for index, instances in rows if len(instances)]
 
     def vertex_normals(self) -> F32:
-        """Return a unit normal for each vertex of `triangles`, float32 (v, 3); zero where the mesh is not smooth.
+        """Return a normal for each vertex of `triangles`, float32 (v, 3); zero where the mesh is not smooth.
 
-        The array has no rows if no mesh is smooth.
+        It is the sum of the normals of the faces around the vertex, as long as twice their areas, and so it is mixed
+        within a triangle: the convention of SpRay's program. The array has no rows if no mesh is smooth.
         """
         if not any(mesh.smooth for mesh in self.meshes):
             return np.zeros((0, 3), np.float32)
@@ -299,9 +299,10 @@ class Scene:
         for index, instances in self._placed:
             local = np.concatenate([_normals(mesh) for mesh in self.objects[index].meshes])
             inverse = np.linalg.pinv(self.instance_transform[instances, :, :3].astype(np.float64))
-            world = np.einsum("nji,vj->nvi", inverse, local)  # normals turn by the inverse transpose
-            length = np.linalg.norm(world, axis=-1, keepdims=True)
-            world = (world / np.where(length > 0.0, length, 1.0)).astype(np.float32)
+            # Normals turn by the inverse transpose; their size must not leave float32's range.
+            world = np.einsum("nji,vj->nvi", inverse, local)
+            largest = np.abs(world).max(axis=(1, 2), keepdims=True)
+            world = (world / np.where(largest > 0.0, largest, 1.0)).astype(np.float32)
             parts.update(zip(instances.tolist(), world, strict=True))
         return np.concatenate([parts[i] for i in range(len(self.instance_object))])
 
@@ -339,12 +340,11 @@ class Scene:
 
     def scaled(self, factor: float) -> Scene:
         """Return the scene in other units of length: every length times a factor, radiance as it is."""
+        def times(triple: tuple[float, float, float], by: float) -> tuple[float, float, float]:
+            return triple[0] * by, triple[1] * by, triple[2] * by
+
         points = tuple(
-            replace(
-                p,
-                position=tuple(x * factor for x in p.position),
-                intensity=tuple(i * factor**2 for i in p.intensity) if p.falloff else p.intensity,
-            )
+            PointLight(times(p.position, factor), times(p.intensity, factor**2 if p.falloff else 1.0), p.falloff)
             for p in self.points
         )
         return replace(

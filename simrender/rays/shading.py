@@ -8,38 +8,20 @@ limit or by Russian roulette on its throughput. A ray has at most two children, 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from simrender.rays.integrators import PathTracing
 from simrender.rays.kinds import DIFFUSE, MIRROR, SHADOW
 from simrender.rays.sampling import cosine_direction, offset_origin, path_key, uniform
-from simrender.rays.scene import Scene
+from simrender.rays.scene import Environment, Scene
 
 # Dimensions of the random numbers at a surface; lights use two (which, by reservoir) plus three (where) each.
 _LOBE, _ROULETTE, _DIRECTION, _LIGHTS = 0, 1, 2, 4
 _JITTER = 0
-
-
-@dataclass(frozen=True)
-class Bounces:
-    """When a path ends.
-
-    Attributes
-    ----------
-    diffuse, mirror : int
-        The most diffuse and mirror-like bounces of a path.
-    roulette : float
-        A path whose throughput (its largest channel) falls below this survives with the quotient as probability.
-
-    """
-
-    diffuse: int = 3
-    mirror: int = 4
-    roulette: float = 0.3
 
 
 class Surfaces:
@@ -54,12 +36,14 @@ class Surfaces:
     def __init__(self, scene: Scene) -> None:
         triangles = scene.triangles
         self.vertices, self.faces = triangles.vertices, triangles.faces
+        self.normals, self.colors = scene.vertex_normals(), scene.vertex_colors()
         self.material = scene.mesh_material[triangles.mesh]
         rows = [(*m.albedo, m.mirror, *m.emission) for m in scene.materials]
         self.materials = np.array(rows, dtype=np.float64).reshape(-1, 7)
-        sky = scene.environment
-        self.sky = np.array([*sky.zenith, *sky.horizon, *sky.ground, *sky.up], dtype=np.float64)
-        self.points = np.array([(*p.position, *p.intensity) for p in scene.points], np.float64).reshape(-1, 6)
+        self.sky = sky_row(scene.environment)
+        points = [(*p.position, *p.intensity, float(p.falloff)) for p in scene.points]
+        self.points = np.array(points, np.float64).reshape(-1, 7)
+        self.hemispheres = np.array(scene.hemispheres, np.float64).reshape(-1, 3)
         emits = np.any(self.materials[:, 4:] > 0, axis=1)
         self.light_first, self.light_rows = self._area_lights(np.flatnonzero(emits[scene.mesh_material]), scene)
 
@@ -86,7 +70,14 @@ class Surfaces:
         return np.array(first), np.concatenate(rows)
 
 
-def camera_rays(camera: NDArray[np.float64], size: tuple[int, int], seed: int, sample: int) -> tuple[Any, Any]:
+def sky_row(sky: Environment) -> NDArray[np.float64]:
+    """Return an environment as kernels take it, float64 (12,)."""
+    return np.array([*sky.zenith, *sky.horizon, *sky.ground, *sky.up], dtype=np.float64)
+
+
+def camera_rays(
+    camera: NDArray[np.float64], size: tuple[int, int], seed: int, sample: int, *, jitter: bool = True
+) -> tuple[Any, Any]:
     """Return origins and unit directions of one ray a pixel, float32 (height * width, 3), row by row from the top.
 
     Parameters
@@ -96,21 +87,24 @@ def camera_rays(camera: NDArray[np.float64], size: tuple[int, int], seed: int, s
     size : (width, height)
     seed, sample : int
         Each sample of a pixel goes through another random point of it.
+    jitter : bool
+        False sends every ray through its pixel's lower left corner, as SpRay does with one sample a pixel.
 
     """
     width, height = size
     origins = np.zeros((width * height, 3), np.float32)
     directions = np.zeros((width * height, 3), np.float32)
-    _camera_rays(camera, width, height, seed, sample, origins, directions)
+    _camera_rays(camera, width, height, seed, sample, jitter, origins, directions)
     return origins, directions
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _camera_rays(camera, width, height, seed, sample, origins, directions):  # type: ignore[no-untyped-def]
+def _camera_rays(camera, width, height, seed, sample, jitter, origins, directions):  # type: ignore[no-untyped-def]
     for pixel in range(width * height):
         key = path_key(seed, pixel, sample, 0)
-        x = 2.0 * (pixel % width + uniform(key, _JITTER)) / width - 1.0
-        y = 1.0 - 2.0 * (pixel // width + uniform(key, _JITTER + 1)) / height
+        right, down = (uniform(key, _JITTER), uniform(key, _JITTER + 1)) if jitter else (0.0, 1.0)
+        x = 2.0 * (pixel % width + right) / width - 1.0
+        y = 1.0 - 2.0 * (pixel // width + down) / height
         length = 0.0
         for axis in range(3):
             component = camera[1, axis] + x * camera[2, axis] + y * camera[3, axis]
@@ -121,7 +115,7 @@ def _camera_rays(camera, width, height, seed, sample, origins, directions):  # t
             directions[pixel, axis] /= math.sqrt(length)
 
 
-def shade(rays: dict[str, Any], hits: Any, surfaces: Surfaces, bounces: Bounces, seed: int) -> dict[str, Any]:
+def shade(rays: dict[str, Any], hits: Any, surfaces: Surfaces, path: PathTracing, seed: int) -> dict[str, Any]:
     """Shade a chunk of rays.
 
     Parameters
@@ -134,7 +128,7 @@ def shade(rays: dict[str, Any], hits: Any, surfaces: Surfaces, bounces: Bounces,
     Returns
     -------
     dict of arrays
-        For each ray ``radiance`` (float32 (n, 3), what it adds to its pixel) and ``children`` (uint8 (n,), how many it
+        For each ray ``radiance`` (float32 (n, 3), what it adds to its pixel) and ``children`` (uint16 (n,), how many it
         spawns); for its children, in the order of their parents, the columns of the ray table.
 
     """
@@ -147,13 +141,13 @@ def shade(rays: dict[str, Any], hits: Any, surfaces: Surfaces, bounces: Bounces,
         "parent": np.zeros(2 * n, np.int32),
         "kind": np.zeros(2 * n, np.uint8),
     }
-    radiance, children = np.zeros((n, 3), np.float32), np.zeros(n, np.uint8)
+    radiance, children = np.zeros((n, 3), np.float32), np.zeros(n, np.uint16)
     spawned = _shade(
         rays["direction"], rays["throughput"], rays["pixel"], rays["sample"], rays["kind"], rays["diffuse"],
         rays["mirror"], hits.primitive, hits.u, hits.v,
-        surfaces.vertices, surfaces.faces, surfaces.material, surfaces.materials, surfaces.sky, surfaces.points,
+        surfaces.vertices, surfaces.faces, surfaces.normals, surfaces.colors, surfaces.material, surfaces.materials, surfaces.sky, surfaces.points,
         surfaces.light_first, surfaces.light_rows,
-        bounces.diffuse, bounces.mirror, bounces.roulette, seed,
+        path.diffuse, path.mirror, path.roulette, seed,
         radiance, children, out["origin"], out["origin"].view(np.int32), out["direction"], out["throughput"],
         out["reach"], out["parent"], out["kind"],
     )  # fmt: skip
@@ -167,7 +161,8 @@ def shade(rays: dict[str, Any], hits: Any, surfaces: Surfaces, bounces: Bounces,
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _sky(sky, dx, dy, dz, channel):  # type: ignore[no-untyped-def]
+def sky_color(sky, dx, dy, dz, channel):  # type: ignore[no-untyped-def]
+    """Return one channel of what a ray in a direction sees of the sky."""
     height = dx * sky[9] + dy * sky[10] + dz * sky[11]
     if height >= 0.0:
         blend = math.sqrt(height)
@@ -177,9 +172,47 @@ def _sky(sky, dx, dy, dz, channel):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def surface_point(primitive, u, v, dx, dy, dz, vertices, faces, normals, colors, material_of, materials):  # type: ignore[no-untyped-def]
+    """Return a hit's point, the face's unit normal, the shading normal (both towards the viewer) and the albedo.
+
+    The point comes from the triangle's corners: exact to an ulp however far the ray came (Waechter and Binder). The
+    face normal of a degenerate triangle is zero.
+    """
+    a, b, c = faces[primitive, 0], faces[primitive, 1], faces[primitive, 2]
+    # Numba's float() leaves a float32 what it is.
+    ax, ay, az = np.float64(vertices[a, 0]), np.float64(vertices[a, 1]), np.float64(vertices[a, 2])
+    ex, ey, ez = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
+    fx, fy, fz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
+    px, py, pz = ax + u * ex + v * fx, ay + u * ey + v * fy, az + u * ez + v * fz
+    gx, gy, gz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
+    length = math.sqrt(gx * gx + gy * gy + gz * gz)
+    m = material_of[primitive]
+    ar, ag, ab = materials[m, 0], materials[m, 1], materials[m, 2]
+    if length == 0.0:
+        return px, py, pz, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, ar, ag, ab
+    length = -length if gx * dx + gy * dy + gz * dz > 0.0 else length
+    gx, gy, gz = gx / length, gy / length, gz / length
+    nx, ny, nz = gx, gy, gz
+    w = 1.0 - u - v
+    if len(normals) > 0:
+        sx = w * normals[a, 0] + u * normals[b, 0] + v * normals[c, 0]
+        sy = w * normals[a, 1] + u * normals[b, 1] + v * normals[c, 1]
+        sz = w * normals[a, 2] + u * normals[b, 2] + v * normals[c, 2]
+        length = math.sqrt(sx * sx + sy * sy + sz * sz)
+        if length > 0.0:
+            length = -length if sx * dx + sy * dy + sz * dz > 0.0 else length
+            nx, ny, nz = sx / length, sy / length, sz / length
+    if len(colors) > 0 and colors[a, 0] >= 0.0:
+        ar = w * colors[a, 0] + u * colors[b, 0] + v * colors[c, 0]
+        ag = w * colors[a, 1] + u * colors[b, 1] + v * colors[c, 1]
+        ab = w * colors[a, 2] + u * colors[b, 2] + v * colors[c, 2]
+    return px, py, pz, gx, gy, gz, nx, ny, nz, ar, ag, ab
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _shade(  # type: ignore[no-untyped-def]
     direction, throughput, pixel, sample, kind, diffuse_bounces, mirror_bounces, primitive, u, v,
-    vertices, faces, material_of, materials, sky, points, light_first, light_rows,
+    vertices, faces, normals, colors, material_of, materials, sky, points, light_first, light_rows,
     most_diffuse, most_mirror, roulette, seed,
     radiance, children, out_origin, out_bits, out_direction, out_throughput, out_reach, out_parent, out_kind,
 ):  # fmt: skip
@@ -192,24 +225,17 @@ def _shade(  # type: ignore[no-untyped-def]
                 for c in range(3):
                     radiance[i, c] = throughput[i, c]
             continue
-        dx, dy, dz = float(direction[i, 0]), float(direction[i, 1]), float(direction[i, 2])
+        dx, dy, dz = np.float64(direction[i, 0]), np.float64(direction[i, 1]), np.float64(direction[i, 2])
         if missed:
             for c in range(3):
-                radiance[i, c] = throughput[i, c] * _sky(sky, dx, dy, dz, c)
+                radiance[i, c] = throughput[i, c] * sky_color(sky, dx, dy, dz, c)
             continue
 
-        # The hit point from the triangle's corners: exact to an ulp however far the ray came (Waechter-Binder).
-        a, b, c3 = faces[primitive[i], 0], faces[primitive[i], 1], faces[primitive[i], 2]
-        ax, ay, az = float(vertices[a, 0]), float(vertices[a, 1]), float(vertices[a, 2])
-        ex, ey, ez = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
-        fx, fy, fz = vertices[c3, 0] - ax, vertices[c3, 1] - ay, vertices[c3, 2] - az
-        px, py, pz = ax + u[i] * ex + v[i] * fx, ay + u[i] * ey + v[i] * fy, az + u[i] * ez + v[i] * fz
-        nx, ny, nz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
-        length = math.sqrt(nx * nx + ny * ny + nz * nz)
-        if length == 0.0:
+        px, py, pz, gx, gy, gz, nx, ny, nz, ar, ag, ab = surface_point(
+            primitive[i], np.float64(u[i]), np.float64(v[i]), dx, dy, dz, vertices, faces, normals, colors, material_of, materials
+        )
+        if gx == 0.0 and gy == 0.0 and gz == 0.0:
             continue  # a degenerate triangle has no side to scatter to
-        length = -length if nx * dx + ny * dy + nz * dz > 0.0 else length
-        nx, ny, nz = nx / length, ny / length, nz / length
 
         m = material_of[primitive[i]]
         if kind[i] != DIFFUSE:  # light that reached a diffuse bounce directly was counted by its shadow ray
@@ -220,11 +246,7 @@ def _shade(  # type: ignore[no-untyped-def]
         is_mirror = uniform(key, _LOBE) < materials[m, 3]
         if (is_mirror and mirror_bounces[i] >= most_mirror) or (not is_mirror and diffuse_bounces[i] >= most_diffuse):
             continue
-        tr, tg, tb = (
-            throughput[i, 0] * materials[m, 0],
-            throughput[i, 1] * materials[m, 1],
-            throughput[i, 2] * materials[m, 2],
-        )
+        tr, tg, tb = throughput[i, 0] * ar, throughput[i, 1] * ag, throughput[i, 2] * ab
         strongest = max(tr, tg, tb)
         if strongest <= 0.0:
             continue
@@ -237,7 +259,9 @@ def _shade(  # type: ignore[no-untyped-def]
             else:
                 ox, oy, oz = cosine_direction(nx, ny, nz, uniform(key, _DIRECTION), uniform(key, _DIRECTION + 1))
             out_origin[n_out, 0], out_origin[n_out, 1], out_origin[n_out, 2] = px, py, pz
-            offset_origin(out_origin, out_bits, n_out, nx, ny, nz)
+            # The ray starts on the side of the face to which it goes: a smooth normal may point elsewhere.
+            side = 1.0 if ox * gx + oy * gy + oz * gz >= 0.0 else -1.0
+            offset_origin(out_origin, out_bits, n_out, side * gx, side * gy, side * gz)
             out_direction[n_out, 0], out_direction[n_out, 1], out_direction[n_out, 2] = ox, oy, oz
             out_throughput[n_out, 0] = tr / survival
             out_throughput[n_out, 1] = tg / survival
@@ -294,7 +318,7 @@ def _shade(  # type: ignore[no-untyped-def]
                 flip = -1.0 if facing > 0.0 else 1.0
                 sx, sy, sz = flip * sx, flip * sy, flip * sz
             else:
-                geometry = cosine / (squared * math.pi)
+                geometry = cosine / math.pi if points[light - n_area, 6] == 0.0 else cosine / (squared * math.pi)
                 cr, cg, cb = (
                     tr * points[light - n_area, 3] * geometry,
                     tg * points[light - n_area, 4] * geometry,
@@ -313,8 +337,9 @@ def _shade(  # type: ignore[no-untyped-def]
             out_origin[n_out, 0], out_origin[n_out, 1], out_origin[n_out, 2] = kx, ky, kz
             offset_origin(out_origin, out_bits, n_out, mx, my, mz)
             kx, ky, kz = out_origin[n_out, 0], out_origin[n_out, 1], out_origin[n_out, 2]
+        side = 1.0 if (kx - px) * gx + (ky - py) * gy + (kz - pz) * gz >= 0.0 else -1.0
         out_origin[n_out, 0], out_origin[n_out, 1], out_origin[n_out, 2] = px, py, pz
-        offset_origin(out_origin, out_bits, n_out, nx, ny, nz)
+        offset_origin(out_origin, out_bits, n_out, side * gx, side * gy, side * gz)
         wx, wy, wz = kx - out_origin[n_out, 0], ky - out_origin[n_out, 1], kz - out_origin[n_out, 2]
         away = math.sqrt(wx * wx + wy * wy + wz * wz)
         out_direction[n_out, 0], out_direction[n_out, 1], out_direction[n_out, 2] = wx / away, wy / away, wz / away

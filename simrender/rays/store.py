@@ -19,16 +19,23 @@ import numpy as np
 
 from simrender.files import write
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """Part of every key: raise it when the meaning of a stored column changes."""
+
+
+_TRANSPORT = (
+    "scene", "shading", "lighting", "sampling", "volume", "marching", "tracking", "volume_paths", "elements", "element_marching",
+    "compositing", "worlds",
+)  # fmt: skip
+"""The modules that decide what is stored."""
 
 
 @cache
 def code_version() -> str:
     """Return a hash of the code that decides what is stored: light transport, random numbers, and Embree's binding."""
     digest = hashlib.blake2b(metadata.version("embreex").encode(), digest_size=8)
-    for name in ("shading.py", "sampling.py"):
-        digest.update((Path(__file__).parent / name).read_bytes())
+    for name in _TRANSPORT:
+        digest.update((Path(__file__).parent / f"{name}.py").read_bytes())
     return f"{FORMAT_VERSION}-{digest.hexdigest()}"
 
 

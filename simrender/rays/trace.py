@@ -14,15 +14,17 @@ reach        f4       how far the ray goes: to the light for a shadow ray, else 
 throughput   3 x f4   for a shadow ray, the light it brings unless something is in the way
 pixel        i4       row-major from the top left
 sample       u2       which path of the pixel
-kind         u1       camera, diffuse, mirror or shadow: see `kinds.KINDS`
-diffuse      u1       diffuse bounces so far; with ``mirror`` it gives the depth
+kind         u1       camera, diffuse, mirror, shadow or scatter: see `kinds.KINDS`
+diffuse      u1       diffuse bounces and scatterings so far; with ``mirror`` it gives the depth
 mirror       u1       mirror-like bounces so far
 parent       i4       row within the previous generation
 t            f4       distance of the nearest hit over the whole scene; infinite for a miss
-primitive    i4       global id of the triangle hit; -1 for a miss
+primitive    i4       global id of the triangle hit; -1 for none
 radiance     3 x f4   what the ray adds to its pixel when it is retired
-children     u1       how many rays it spawns: 0, 1 or 2
+children     u2       how many rays it spawns
 ============ ======== =============================================================================
+
+Rays through volumes also have their ``work``, u4: samples, look-ups or elements, see `worlds`.
 """
 
 from __future__ import annotations
@@ -38,12 +40,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simrender.rays import embree
+from simrender.rays.integrators import Integrator
 from simrender.rays.kinds import CAMERA, KINDS
 from simrender.rays.scene import Scene
 from simrender.rays.store import NoStore, Store, code_version
 
 if TYPE_CHECKING:
-    from simrender.rays.shading import Bounces, Surfaces
+    from simrender.rays.worlds import World
 
 Ids = NDArray[np.int64]
 Columns = dict[str, Any]
@@ -72,19 +75,23 @@ class Trace:
         Traced pixels.
     samples : int
         Paths a pixel.
-    bounces : Bounces
-        When paths end.
+    integrator : Integrator
+        How light is followed.
     seed : int
         Of all random numbers.
     cache : Path or None
         Folder of the trace cache; None takes the default one.
     progress : callable, optional
         Told how far tracing has come.
+    jitter : bool
+        Whether camera rays go through random points of their pixels, or all through the same corner.
 
     Attributes
     ----------
+    factor : float
+        Units of the scene that was given, in those that are traced.
     traced_rays : int
-        Rays that Embree was asked for in this process; 0 when everything came from the cache.
+        Rays that were really traced in this process; 0 when everything came from the cache.
 
     """
 
@@ -94,18 +101,21 @@ class Trace:
         camera: NDArray[np.float64],
         size: tuple[int, int],
         samples: int,
-        bounces: Bounces,
+        integrator: Integrator,
         seed: int = 1,
         cache: Path | None = None,
         progress: Progress | None = None,
+        *,
+        jitter: bool = True,
     ) -> None:
-        factor = _handy(scene)
+        self.factor = factor = _handy(scene)
         self.scene = scene if factor == 1.0 else scene.scaled(factor)
         self.camera = camera * np.array([[factor], [1.0], [1.0], [1.0]])
         self.size, self.samples = size, samples
-        self.bounces, self.seed, self.progress = bounces, seed, progress
+        self.integrator, self.seed, self.progress, self.jitter = integrator, seed, progress, jitter
         self.pixels = size[0] * size[1]
-        facts = f"{code_version()} {self.scene.key} {self.camera.tobytes().hex()} {size} {samples} {bounces} {seed}"
+        rays = f"{self.camera.tobytes().hex()} {size} {samples} {integrator} {seed} {jitter}"
+        facts = f"{code_version()} {self.scene.key} {rays}"
         self.key = hashlib.blake2b(facts.encode(), digest_size=16).hexdigest()
         self.store = Store(self.key, cache)
         self.traced_rays = 0
@@ -133,7 +143,8 @@ class Trace:
             return rays
         self._know(int(rays.max()))
         spawned, first = self.column("children")[rays], self.column("first_child")[rays]
-        return np.concatenate([first[spawned > 0], first[spawned > 1] + 1])
+        found = [first[spawned > k] + k for k in range(int(spawned.max()))]
+        return np.concatenate(found) if found else np.zeros(0, np.int64)
 
     def column(self, name: str) -> Any:
         """Return an outcome column over all generations known so far, one row a ray."""
@@ -199,7 +210,9 @@ class Trace:
             found = self.store.load(f"{generation:03d}-rays", GEOMETRY, rays)
             if found is None:
                 # Damaged since it was written: the same rays come out when they are traced again.
-                again = Trace(self.scene, self.camera, self.size, self.samples, self.bounces, self.seed)
+                again = Trace(
+                    self.scene, self.camera, self.size, self.samples, self.integrator, self.seed, jitter=self.jitter
+                )
                 again.store = NoStore()
                 again._know(self.first[generation])
                 found = again._geometry[generation]
@@ -210,16 +223,11 @@ class Trace:
     # -- how it comes about ---------------------------------------------------------------------------------------
 
     @cached_property
-    def surfaces(self) -> Surfaces:
-        """The scene as the shading kernel takes it; made when the first ray is really traced."""
-        from simrender.rays.shading import Surfaces
+    def world(self) -> World:
+        """The scene, ready for the integrator."""
+        from simrender.rays.worlds import world
 
-        return Surfaces(self.scene)
-
-    @cached_property
-    def everything(self) -> embree.Geometry:
-        """The whole scene in one hierarchy; built when the first ray is really traced."""
-        return embree.Geometry(self.scene.triangles.vertices, self.scene.triangles.faces)
+        return world(self.scene, self.integrator)
 
     def _know(self, ray: int) -> None:
         while self.first[-1] <= ray:
@@ -240,33 +248,24 @@ class Trace:
         self._joined.clear()
         return True
 
+    @property
+    def _outcome(self) -> tuple[str, ...]:
+        return (*OUTCOME, *self.world.outcome)
+
     def _load(self, generation: int) -> Columns | None:
         expected = int(self._outcomes[-1]["children"].sum()) if generation else self.pixels * self.samples
-        return self.store.load(f"{generation:03d}-hits", OUTCOME, expected)
+        return self.store.load(f"{generation:03d}-hits", self._outcome, expected)
 
     def _trace(self, generation: int) -> Columns:
-        from simrender.rays import shading
-
         rays = self._first_rays() if generation == 0 else self._spawned_rays(generation)
         count = len(rays["kind"])
-        scene, surfaces = self.everything, self.surfaces
-
-        def work(rows: slice) -> Columns:
-            chunk = {name: column[rows] for name, column in rays.items()}
-            hits = scene.nearest(chunk["origin"], chunk["direction"], chunk["reach"])
-            shaded = shading.shade(chunk, hits, surfaces, self.bounces, self.seed)
-            shaded["parent"] = shaded["parent"] + np.int32(rows.start)
-            return shaded | {"t": hits.t, "primitive": hits.primitive}
-
-        work(slice(0, 0))  # loads the kernels, or compiles them the first time
         report = partial(self._report, generation, count)
         report(0)
-        parts = embree.in_chunks(work, count, report)
+        made = self.world.follow(rays, self.seed, report)
         self.traced_rays += count
-        found = ("t", "primitive", "radiance", "children")
-        joined = embree.on_all_cores(lambda n: np.concatenate([p[n] for p in parts]), found + GEOMETRY)
-        outcome = dict(zip(found, joined, strict=False)) | {"kind": rays["kind"], "pixel": rays["pixel"]}
-        spawned = dict(zip(GEOMETRY, joined[len(found) :], strict=True))
+        own = {"kind": rays["kind"], "pixel": rays["pixel"]}
+        outcome = {name: own[name] if name in own else made[name] for name in self._outcome}
+        spawned = {name: made[name] for name in GEOMETRY}
         self._geometry[generation], self._geometry[generation + 1] = rays, spawned
         files = ((f"{generation + 1:03d}-rays", spawned), (f"{generation:03d}-hits", outcome))
         embree.on_all_cores(lambda file: self.store.save(*file), files)
@@ -280,7 +279,8 @@ class Trace:
         from simrender.rays import shading
 
         cast = embree.on_all_cores(
-            lambda sample: shading.camera_rays(self.camera, self.size, self.seed, sample), range(self.samples)
+            lambda sample: shading.camera_rays(self.camera, self.size, self.seed, sample, jitter=self.jitter),
+            range(self.samples),
         )
         n = self.pixels * self.samples
         return {

@@ -1,8 +1,4 @@
-"""Workloads: a scene, a camera and an image; at the size that was published and at the size that is traced.
-
-A workload card states both sizes. Each traced ray stands for ``weight`` published ones: bytes and compute scale with
-it, batches and latencies do not.
-"""
+"""Workloads: a scene, a camera and an image; at the size that was published and at the size that is traced."""
 
 from __future__ import annotations
 
@@ -12,138 +8,23 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field, field_validator, model_validator
-from pydantic_core import PydanticCustomError
 
-from simrender.cards import Card, Count, Document, Quantity, Size
+from simrender.cards import Document
 from simrender.catalog import find_card, load_function
 from simrender.errors import CardError, SceneError, UsageError
-from simrender.rays.meshes import FORMATS, read_scene
+from simrender.rays.files import FORMATS, SceneFile, read_file
+from simrender.rays.integrators import Integrator, PathTracing
 from simrender.rays.partition import Footprint, Method, Partition, Published, partition, pieces
-from simrender.rays.scene import Scene
+from simrender.rays.scene import F32, Scene
 from simrender.rays.trace import Progress, Trace
+from simrender.rays.workload_card import DomainsCard, WorkloadCard
 
 if TYPE_CHECKING:
     from simrender.rays.crossings import Crossings
-    from simrender.rays.shading import Bounces
-
-Vector = Annotated[tuple[float, float, float], Field(description="x, y, z")]
-
-
-def _size(text: Any) -> Any:
-    if isinstance(text, (list, tuple)):
-        return text
-    width, cross, height = str(text).partition("x")
-    if not (cross and width.isdigit() and height.isdigit() and int(width) > 0 and int(height) > 0):
-        message = {"message": f"expected WIDTHxHEIGHT in pixels such as '2560x1080', got {text!r}"}
-        raise PydanticCustomError("quantity", "{message}", message)
-    return int(width), int(height)
-
-
-Resolution = Annotated[tuple[int, int], BeforeValidator(_size)]
-
-
-class PublishedCard(Card):
-    """The size of the real thing; the scene's own size where a field is left out.
-
-    ``growth`` makes the scene larger by any factor, as section 5.2 of the ray queue cycling paper does: so many times
-    the triangles in each mesh, so many times the instances, and so the square of it in instanced triangles.
-    """
-
-    resolution: Resolution
-    samples: Annotated[int, Field(ge=1, le=65535)]
-    triangles: Count | None = None
-    instances: Count | None = None
-    instanced_triangles: Count | None = None
-    geometry_bytes: Size | None = None
-    texture_bytes: Size | None = None
-    growth: Count = Quantity(1.0)
-
-
-class TracedCard(Card):
-    """The size that is really traced."""
-
-    resolution: Resolution
-
-
-class SceneCard(Card):
-    """Where the scene comes from: a mesh file beside the card, or a generator and its arguments."""
-
-    file: str | None = None
-    generator: str | None = None
-    arguments: dict[str, float | int | str] = Field(default_factory=dict)
-
-    @model_validator(mode="after")
-    def _one_source(self) -> SceneCard:
-        if (self.file is None) == (self.generator is None):
-            raise ValueError("a scene has exactly one of the fields file and generator")
-        if self.file is not None and self.arguments:
-            raise ValueError("arguments are for a generator, and this scene comes from a file")
-        return self
-
-
-class CameraCard(Card):
-    """A pinhole camera."""
-
-    position: Vector
-    look_at: Vector
-    up: Vector = (0.0, 0.0, 1.0)
-    vertical_fov_degrees: Annotated[float, Field(gt=0, lt=180)] = 40.0
-
-    @model_validator(mode="after")
-    def _has_a_direction(self) -> CameraCard:
-        forward = np.subtract(self.look_at, self.position)
-        if not np.linalg.norm(np.cross(forward, self.up)) > 0.0:
-            raise ValueError("the camera looks nowhere: look_at equals position, or lies straight along up")
-        return self
-
-    def frame(self, aspect: float) -> NDArray[np.float64]:
-        """Return position, forward, right and up as `shading.camera_rays` takes them, for width / height."""
-        position, up = np.array(self.position), np.array(self.up)
-        forward = np.array(self.look_at) - position
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, up)
-        right /= np.linalg.norm(right)
-        half = math.tan(math.radians(self.vertical_fov_degrees) / 2.0)
-        return np.stack([position, forward, right * half * aspect, np.cross(right, forward) * half])
-
-
-class BouncesCard(Card):
-    """When a path ends; see `shading.Bounces`."""
-
-    diffuse: Annotated[int, Field(ge=0, le=200)] = 3
-    mirror: Annotated[int, Field(ge=0, le=200)] = 4
-    roulette: Annotated[float, Field(ge=0, le=1)] = 0.3
-
-
-class WorkloadCard(Card):
-    """A workload. ``policy`` holds the name and the parameters of the scheduler that renders it by default."""
-
-    title: str
-    published: PublishedCard
-    traced: TracedCard
-    scene: SceneCard
-    camera: CameraCard
-    bounces: BouncesCard = BouncesCard()
-    policy: dict[str, Any] = Field(default_factory=lambda: {"name": "ray_queue_cycling"})
-
-    @field_validator("policy")
-    @classmethod
-    def _has_a_name(cls, policy: dict[str, Any]) -> dict[str, Any]:
-        if not isinstance(policy.get("name"), str):
-            raise ValueError("a policy has a name, for instance {name: ray_queue_cycling}")
-        return policy
-
-    @model_validator(mode="after")
-    def _traced_stands_for_published(self) -> WorkloadCard:
-        (width, height), (w, h) = self.published.resolution, self.traced.resolution
-        if w * h > width * height:
-            raise ValueError(f"traced.resolution {w}x{h} is larger than published.resolution {width}x{height}")
-        return self
+    from simrender.rays.domains import Domains
 
 
 @dataclass(eq=False)
@@ -160,6 +41,10 @@ class Workload:
         Where the card lies.
     cache : Path or None
         Folder of the trace cache; None takes the default one.
+    given : Scene or None
+        The scene, where it is read already.
+    boxes : two float32 arrays (d, 3) or None
+        Lowest and highest corners of its domains, where its file announces them.
 
     """
 
@@ -169,11 +54,13 @@ class Workload:
     folder: Path
     cache: Path | None = None
     given: Scene | None = None
+    boxes: tuple[F32, F32] | None = None
     _traces: dict[int, Trace] = field(default_factory=dict)
     _crossings: dict[tuple[int, str], Crossings] = field(default_factory=dict)
     _partitions: dict[Any, Partition] = field(default_factory=dict)
+    _domains: dict[str, Domains] = field(default_factory=dict)
 
-    @cached_property
+    @property
     def scene(self) -> Scene:
         """The scene, read or generated when first asked for.
 
@@ -182,11 +69,16 @@ class Workload:
         SceneError, CardError
 
         """
+        return self.content.scene
+
+    @cached_property
+    def content(self) -> SceneFile:
+        """The scene, and the boxes of its domains where a file announces them."""
         if self.given is not None:
-            return self.given
+            return SceneFile(self.given, *(self.boxes or ()))
         scene = self.card.scene
         if scene.file is not None:
-            return read_scene(self.folder / scene.file)
+            return read_file(self.folder / scene.file)
         where = f"{self.document.position(('scene', 'generator'))}: scene.generator"
         generator = load_function(scene.generator or "", where)
         try:
@@ -199,7 +91,7 @@ class Workload:
             raise SceneError(f"{where}: {scene.generator} failed: {type(error).__name__}: {error}") from error
         if not isinstance(made, Scene):
             raise SceneError(f"{where}: {scene.generator} returned a {type(made).__name__}, not a Scene")
-        return made
+        return SceneFile(made)
 
     @cached_property
     def published(self) -> Published:
@@ -215,27 +107,33 @@ class Workload:
         )
 
     @property
+    def samples(self) -> int:
+        """Traced samples a pixel."""
+        return self.card.traced.samples or self.card.published.samples
+
+    @property
     def weight(self) -> float:
-        """Published rays for which a traced ray stands."""
+        """Published rays of one sample a pixel for which a traced ray stands; see `samples` for the others."""
         (width, height), (w, h) = self.card.published.resolution, self.card.traced.resolution
         return width * height / (w * h)
 
     @property
-    def bounces(self) -> Bounces:
-        """When paths end."""
-        from simrender.rays.shading import Bounces
-
-        card = self.card.bounces
-        return Bounces(card.diffuse, card.mirror, card.roulette)
+    def integrator(self) -> Integrator:
+        """How light is followed."""
+        if self.card.integrator.name == "path_tracing":
+            return PathTracing(**self.card.bounces.model_dump())
+        return self.card.integrator.value()
 
     def trace(self, seed: int = 1, progress: Progress | None = None) -> Trace:
         """Return the ray table for a seed; nothing is traced before it is asked for."""
         check_seed(seed)
         if seed not in self._traces:
             (width, height), size = self.card.published.resolution, self.card.traced.resolution
-            camera = self.card.camera.frame(width / height)
-            samples = self.card.published.samples
-            self._traces[seed] = Trace(self.scene, camera, size, samples, self.bounces, seed, self.cache)
+            camera, jitter = self.card.camera, self.card.camera.sampling == "jittered"
+            self._traces[seed] = Trace(
+                self.scene, camera.at(0.0).frame(width / height), size, self.samples, self.integrator, seed, self.cache,
+                jitter=jitter,
+            )  # fmt: skip
         self._traces[seed].progress = progress
         return self._traces[seed]
 
@@ -244,8 +142,43 @@ class Workload:
         key = (seed, of.key)
         if key not in self._crossings:
             from simrender.rays.crossings import Crossings
+            from simrender.rays.domains import from_objects
 
-            self._crossings[key] = Crossings(self.trace(seed), of)
+            trace = self.trace(seed)
+            self._crossings[key] = Crossings(trace, from_objects(trace.scene, of))
+        return self._crossings[key]
+
+    def domains(self, card: DomainsCard | None = None) -> Domains:
+        """Return the domains in which the data comes, or into which another card cuts it; in the traced scene's units.
+
+        A workload whose card says nothing of domains is cut into eight, but for an unstructured mesh.
+
+        Raises
+        ------
+        SceneError
+            If the scene cannot be cut in this way.
+
+        """
+        from simrender.rays.data import cut
+
+        card = card or self.card.domains or self._usual_domains
+        key = repr(card)
+        if key not in self._domains:
+            trace = self.trace()
+            self._domains[key] = cut(trace.scene, card, self.card.published, self.published, self.content, trace.factor)
+        return self._domains[key]
+
+    @property
+    def _usual_domains(self) -> DomainsCard:
+        return DomainsCard() if self.scene.elements is not None else DomainsCard(method="auto", count=8)
+
+    def domain_crossings(self, seed: int, domains: Domains) -> Crossings:
+        """Return the crossing table of a trace and domains."""
+        key = (seed, domains.key)
+        if key not in self._crossings:
+            from simrender.rays.crossings import Crossings
+
+            self._crossings[key] = Crossings(self.trace(seed), domains)
         return self._crossings[key]
 
     def partition(self, domains: int, footprint: Footprint, method: Method, split_share: float) -> Partition:
@@ -264,13 +197,13 @@ class Workload:
 
 
 def load_workload(name: str, overrides: Sequence[str] = (), cache: Path | None = None) -> Workload:
-    """Return a workload by name, by the path of its card, or by the path of a mesh file.
+    """Return a workload by name, by the path of its card, or by the path of a file that holds a scene.
 
     Parameters
     ----------
     name : str
-        ``island``, ``my/card.yaml`` or ``my/mesh.ply``. A mesh file is framed by a camera that sees all of it, and
-        rendered at 1920x1080 with 8 paths a pixel.
+        ``island``, ``my/card.yaml``, ``my/mesh.ply`` or another file of the `FORMATS`. A mesh or volume is framed by a
+        camera that sees all of it, and rendered at 1920x1080; a mesh with 8 paths a pixel.
     overrides : list of str
         ``PATH=VALUE`` without the leading ``workload.``.
     cache : Path, optional
@@ -284,8 +217,8 @@ def load_workload(name: str, overrides: Sequence[str] = (), cache: Path | None =
     path = Path(name)
     given = None
     if path.suffix.lower() in FORMATS:
-        given = read_scene(path)
-        document = _mesh_card(path, given)
+        given = read_file(path)
+        document = _file_card(path, given)
     else:
         found = find_card("workload", name)
         path, document, name = found.path, found.document(), found.name
@@ -294,7 +227,10 @@ def load_workload(name: str, overrides: Sequence[str] = (), cache: Path | None =
     card = document.validate(WorkloadCard)
     if card.scene.file != path.name:
         given = None  # another scene was set
-    return Workload(path.stem if given else name, card, document, path.parent, cache, given)
+    if given is None:
+        return Workload(name, card, document, path.parent, cache)
+    boxes = None if given.low is None or given.high is None else (given.low, given.high)
+    return Workload(path.stem, card, document, path.parent, cache, given.scene, boxes)
 
 
 def check_seed(seed: int) -> None:
@@ -309,28 +245,57 @@ def check_seed(seed: int) -> None:
         raise UsageError(f"--seed {seed}: expected a number from 0 to 2^64 - 1")
 
 
-def _mesh_card(path: Path, scene: Scene) -> Document:
-    """Return a card for a mesh file: the whole mesh in view, from above and aside."""
+SPRAY_VIEW = (1.5043045, 1.43577790780127, 1.312005625)
+"""The viewpoint of the wavelets example of SpRay's authors, from the centre of its box in halves of its sides."""
+
+
+def _file_card(path: Path, content: SceneFile) -> Document:
+    """Return a card for a file that holds a scene: all of it in view, from above and aside."""
+    scene = content.scene
     low, high = (corner.astype(np.float64) for corner in scene.bounds)
+    if content.low is not None and content.high is not None:
+        low, high = content.low.min(axis=0).astype(np.float64), content.high.max(axis=0).astype(np.float64)
     centre, up = 0.5 * (low + high), np.array(scene.environment.up)
+    if path.suffix.lower() == ".spray":
+        # Its scene files have no camera; the program's own defaults otherwise.
+        return _card(
+            path, centre + np.array(SPRAY_VIEW) * 0.5 * (high - low), centre, np.array([0.0, 1.0, 0.0]), 90.0,
+            "{resolution: 512x512, samples: 1}", "{resolution: 512x512}",
+            "domains: {method: given}\nintegrator: {name: spray_path_tracing, bounces: 1, shadow_samples: 1}\n", "corner",
+        )  # fmt: skip
     towards = np.array([0.9, 0.55, 1.0]) if up[1] else np.array([0.9, -1.0, 0.55])
     towards /= np.linalg.norm(towards)
     fov, aspect = 35.0, 16 / 9
     right = np.cross(up, towards) / np.linalg.norm(np.cross(up, towards))
+    integrator, samples = "", 8
+    if scene.volume is None and scene.elements is None:
+        points = scene.triangles.vertices
+    else:
+        points = np.array(np.meshgrid(*zip(low, high, strict=True))).reshape(3, -1).T
+        name = "element_marching" if scene.elements is not None else "volume_marching"
+        integrator, samples = f"integrator: {{name: {name}}}\n", 1
     # As near as every vertex stays in the image, and a little further.
-    x, y, z = np.stack([right, np.cross(towards, right), towards]) @ (scene.triangles.vertices - centre).T
+    x, y, z = np.stack([right, np.cross(towards, right), towards]) @ (points - centre).T
     half = math.tan(math.radians(fov) / 2.0)
     distance = 1.08 * float((z + np.maximum(np.abs(x) / aspect, np.abs(y)) / half).max())
     position = centre + towards * max(distance, 1e-30)
+    published = f"{{resolution: 1920x1080, samples: {samples}}}"
+    return _card(path, position, centre, up, fov, published, "{resolution: 320x180}", integrator, "jittered")
+
+
+def _card(
+    path: Path, position: Any, look_at: Any, up: Any, fov: float, published: str, traced: str, rest: str, sampling: str
+) -> Document:
     text = f"""\
 title: {path.name!r}
-published: {{resolution: 1920x1080, samples: 8}}
-traced: {{resolution: 320x180}}
+published: {published}
+traced: {traced}
 scene: {{file: {path.name!r}}}
 camera:
   position: {position.tolist()}
-  look_at: {centre.tolist()}
+  look_at: {look_at.tolist()}
   up: {up.tolist()}
   vertical_fov_degrees: {fov}
-"""
+  sampling: {sampling}
+{rest}"""
     return Document(text, str(path))

@@ -84,7 +84,7 @@ def _model(kind: Kind) -> type[Card]:
         from simrender.hardware.machine import MachineCard
 
         return MachineCard
-    from simrender.rays.workload import WorkloadCard
+    from simrender.rays.workload_card import WorkloadCard
 
     return WorkloadCard
 

@@ -19,7 +19,8 @@ from simrender import load_machine, simulate
 from simrender.cards import Document
 from simrender.policies.ray_queue_cycling import RayQueueCycling
 from simrender.rays.scene import Mesh, Scene, SceneObject
-from simrender.rays.workload import Workload, WorkloadCard
+from simrender.rays.workload import Workload
+from simrender.rays.workload_card import WorkloadCard
 from tests.scenes import MATERIALS, placed
 
 CARD = """

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from simrender.rays.crossings import Crossings
 from simrender.rays.kinds import SHADOW
 from simrender.rays.partition import Footprint
 from tests.scenes import garden_workload
@@ -15,14 +14,16 @@ RTX = Footprint(50.0, 400.0)
 
 def brute_force(trace, crossings, generation, start):
     """Trace every ray in every domain of its way, one after the other."""
-    domains = crossings.partition.domains
+    domains = crossings.domains.count
     rays = trace.geometry(generation)
     kind = trace.column("kind")[trace.first[generation] : trace.first[generation + 1]]
     visits = np.full(len(kind), domains)
     for r in np.flatnonzero(kind == SHADOW):
         one = slice(r, r + 1)
         for step in range(domains):
-            geometry = crossings.domain_geometry(int((start[rays["pixel"][r]] + step) % domains))
+            geometry = crossings.trace.world.domain_geometry(
+                crossings.domains, int((start[rays["pixel"][r]] + step) % domains)
+            )
             if np.isfinite(geometry.nearest(rays["origin"][one], rays["direction"][one], rays["reach"][one]).t[0]):
                 visits[r] = step + 1
                 break
@@ -34,7 +35,7 @@ def test_visits_agree_with_tracing_every_ray_in_every_domain(domains, tmp_path):
     workload = garden_workload(traced="24x16", published="24x16", cache=tmp_path)
     trace = workload.trace()
     trace.complete()
-    crossings = Crossings(trace, workload.partition(domains, RTX, "heaviest_first", 0.1))
+    crossings = workload.crossings(1, workload.partition(domains, RTX, "heaviest_first", 0.1))
     start = np.arange(24 * 16) % domains
     for generation in range(1, min(4, trace.generations)):
         assert (crossings.domains_visited(generation, start) == brute_force(trace, crossings, generation, start)).all()
@@ -45,12 +46,17 @@ def test_partitioned_and_whole_scene_agree_on_every_hit(tmp_path):
     trace = workload.trace()
     trace.complete()
     partition = workload.partition(4, RTX, "heaviest_first", 0.1)
-    crossings = Crossings(trace, partition)
+    crossings = workload.crossings(1, partition)
     domain_of = partition.domain_of_mesh[trace.scene.triangles.mesh]
     for generation in range(trace.generations):
         rays = trace.geometry(generation)
         parts = np.stack(
-            [crossings.domain_geometry(d).nearest(rays["origin"], rays["direction"], rays["reach"]).t for d in range(4)]
+            [
+                trace.world.domain_geometry(crossings.domains, d)
+                .nearest(rays["origin"], rays["direction"], rays["reach"])
+                .t
+                for d in range(4)
+            ]
         )
         whole = slice(trace.first[generation], trace.first[generation + 1])
         t, primitive = trace.column("t")[whole], trace.column("primitive")[whole]
@@ -65,19 +71,19 @@ def test_a_second_table_asks_embree_nothing(tmp_path):
         workload = garden_workload(cache=tmp_path)
         trace = workload.trace()
         trace.complete()
-        crossings = Crossings(trace, workload.partition(4, RTX, "heaviest_first", 0.1))
+        crossings = workload.crossings(1, workload.partition(4, RTX, "heaviest_first", 0.1))
         for generation in range(trace.generations):
             crossings.domains_visited(generation, start)
         crossings.save()
-        assert (crossings.traced_rays > 0) == asked
+        assert (crossings.asked_rows > 0) == asked
 
 
 def test_a_ray_asks_no_more_than_the_scheduler_can_tell_apart(tmp_path):
     workload = garden_workload(cache=tmp_path)
     trace = workload.trace()
     trace.complete()
-    crossings = Crossings(trace, workload.partition(8, RTX, "heaviest_first", 0.1))
+    crossings = workload.crossings(1, workload.partition(8, RTX, "heaviest_first", 0.1))
     for generation in range(trace.generations):
         crossings.domains_visited(generation, np.zeros(96 * 64, int))
     occluded = ((trace.column("kind") == SHADOW) & np.isfinite(trace.column("t"))).sum()
-    assert 0 < crossings.traced_rays < 4 * occluded  # of 8 domains each
+    assert 0 < crossings.asked_rows < 4 * occluded  # of 8 domains each

@@ -7,7 +7,7 @@ import pytest
 
 from simrender.rays.kinds import CAMERA, DIFFUSE, MIRROR, SHADOW
 from simrender.rays.scene import IDENTITY, Environment, Material, Mesh, PointLight, Scene, SceneObject
-from simrender.rays.shading import Bounces
+from simrender.rays.integrators import PathTracing
 from simrender.rays.store import CacheWarning
 from simrender.rays.trace import Trace
 from tests.scenes import garden, garden_workload, grid, placed, sphere
@@ -27,7 +27,7 @@ def plane(size: float = 50.0) -> Mesh:
 
 
 def traced(scene: Scene, camera=TOWARDS_Y, size=(24, 24), samples=4, bounces=None, seed=1, cache=None) -> Trace:
-    trace = Trace(scene, camera, size, samples, bounces or Bounces(16, 16, 0.3), seed, cache)
+    trace = Trace(scene, camera, size, samples, bounces or PathTracing(16, 16, 0.3), seed, cache)
     trace.complete()
     return trace
 
@@ -42,7 +42,7 @@ def test_furnace_with_absorption_and_roulette_keeps_the_mean(tmp_path):
     # Inside a closed sphere of albedo a that emits e, the radiance is e / (1 - a) everywhere.
     material = Material((0.5, 0.5, 0.5), 0.3, (1.0, 1.0, 1.0))
     inside = np.array([[0, 0, 0], [0, 1, 0], [1, 0, 0], [0, 0, 1]], float)
-    trace = traced(one(sphere(rings=8), material), inside, (32, 32), 64, Bounces(60, 60, 0.5), cache=tmp_path)
+    trace = traced(one(sphere(rings=8), material), inside, (32, 32), 64, PathTracing(60, 60, 0.5), cache=tmp_path)
     image = trace.image().astype(float)
     error = image.std() / np.sqrt(image.size / 3)
     assert image.mean() == pytest.approx(2.0, abs=4 * error)
@@ -58,7 +58,7 @@ def test_a_point_light_over_a_floor_matches_the_closed_form(tmp_path):
     )
     down = np.array([[0, 0, 3.0], [0, 0, -1], [0.01, 0, 0], [0, 0.01, 0]], float)
     # The lamp is nearer than the camera and has no body, so the camera sees the floor below it.
-    image = traced(scene, down, (8, 8), 2, Bounces(1, 0, 0.0), cache=tmp_path).image()
+    image = traced(scene, down, (8, 8), 2, PathTracing(1, 0, 0.0), cache=tmp_path).image()
     assert image.mean() == pytest.approx(albedo / np.pi * intensity / height**2, rel=1e-3)
 
 
@@ -72,7 +72,7 @@ def test_an_area_light_lights_the_floor_like_its_form_factor(tmp_path):
     transforms = placed(np.array([[0, 0, 0], [0, 0, height]]), np.ones(2))
     scene = Scene(objects, np.array([0, 1]), transforms, materials, (), dark)
     down = np.array([[0, 0, 2.0], [0, 0, -1], [0.01, 0, 0], [0, 0.01, 0]], float)
-    image = traced(scene, down, (16, 16), 8, Bounces(1, 0, 0.0), cache=tmp_path).image()
+    image = traced(scene, down, (16, 16), 8, PathTracing(1, 0, 0.0), cache=tmp_path).image()
     assert image.mean() == pytest.approx(0.5 / np.pi * radiance * side**2 / height**2, rel=5e-3)
 
 
@@ -86,7 +86,7 @@ def test_bounce_limits_and_children(tmp_path):
     trace = traced(
         garden(),
         np.array([[5.5, -5, 3], [-0.7, 0.65, -0.3], [0.5, 0, 0], [0, 0.2, 0.4]]),
-        bounces=Bounces(2, 1, 0.4),
+        bounces=PathTracing(2, 1, 0.4),
         cache=tmp_path,
     )
     kinds, children = trace.column("kind"), trace.column("children")
@@ -189,7 +189,7 @@ def test_a_scene_a_million_times_smaller_or_larger_gives_the_same_image(power, t
     images = []
     for workload, factor in ((plain, 1.0), (other, 2.0**power)):
         placed_camera = camera * np.array([[factor], [1], [1], [1]])
-        trace = Trace(workload.scene, placed_camera, (48, 32), 1, workload.bounces, 1, tmp_path)
+        trace = Trace(workload.scene, placed_camera, (48, 32), 1, workload.integrator, 1, tmp_path)
         trace.complete()
         images.append(trace.image())
     # The plain garden is traced at its own size, the others at a power of two of it, where only the fixed step of

@@ -1,0 +1,499 @@
+"""Marching rays from element to element through the parts of an unstructured volume.
+
+This is what a rank of the deep compositor does (islands paper, section 7; Sahistan et al., "Ray-traced shell traversal
+of tetrahedral meshes for direct volume visualization", 2021): a ray enters a non-convex part through a triangle of its
+boundary, walks from neighbour to neighbour, samples each element at least once, and leaves through another triangle
+of the boundary. Such a *segment* becomes a *fragment*: a colour with a depth. The ray may then enter the part again.
+
+No ray is ever lost, by construction. Points are projected along the ray onto a plane, once each and in float64; whether
+the ray passes left or right of an edge is the sign of a 2 x 2 determinant of these, which is computed exactly, and an
+exact tie is resolved as if the ray were moved aside by an infinitesimal amount (Edelsbrunner and Muecke, "Simulation of
+simplicity", 1990). So a ray meets no edge and no vertex; of the four triangles of a tetrahedron it passes either none
+or exactly two, one inwards and one outwards; hence tetrahedra that share the triangles it passes are strung to chains
+without branches or loops, each from an entry to an exit on the boundary. Neighbouring parts have the same points, so
+together their chains are those of the whole mesh. Embree, in float32, promises this for one surface at a time but not
+for an entry and its exit, so the boundary has a hierarchy of its own here, with generous boxes and exact triangles.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from simrender.errors import SceneError
+from simrender.rays import embree
+from simrender.rays.elements import SIDES, TRIANGLES, TURN, Elements, boundary
+from simrender.rays.volume import find_row
+
+F32 = NDArray[np.float32]
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+
+_LEAF = 4
+"""Triangles in a leaf of the boundary's hierarchy."""
+
+_SLACK = 1e-9
+"""How much its boxes are grown, relative to the coordinates: far above rounding in float64, far below a triangle."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fragments:
+    """What came of (ray, part) rows.
+
+    Attributes
+    ----------
+    row : int64 array (f,)
+        The row of each fragment, ascending; the fragments of a row are front to back.
+    entry, exit : float32 array (f,)
+        Where the ray enters and leaves the part, within 0 and its reach; ``entry`` is the fragment's depth.
+    rgba : float32 array (f, 4)
+        Colour and opacity, premultiplied; fully transparent fragments are left out.
+    elements, samples, segments : int32 array (n,)
+        Elements walked, samples taken and segments found in each row, those of rejected fragments included.
+
+    """
+
+    row: I64
+    entry: F32
+    exit: F32
+    rgba: F32
+    elements: I32
+    samples: I32
+    segments: I32
+
+
+def march_parts(
+    elements: Elements, rays: Mapping[str, Any], row_ray: I64, row_part: I32, *, step: float = math.inf
+) -> Fragments:
+    """Integrate colour and opacity along rays, each row a ray in one part, on all cores.
+
+    An element gets one sample or, if its stretch of the ray is longer than ``step``, as many as keep them no further
+    apart. A sample stands for an equal share of the stretch and lies in its middle. There is no early termination: a
+    rank does not know what lies in front of its part (islands paper, section 7).
+
+    Parameters
+    ----------
+    elements : Elements
+    rays : mapping
+        Columns ``origin`` and ``direction``, float32 (r, 3), directions of unit length, and ``reach``, float32 (r,).
+    row_ray : int64 array (n,)
+        The ray of each row.
+    row_part : int32 array (n,)
+        The part of each row.
+    step : float
+        Largest distance between samples in world units.
+
+    Raises
+    ------
+    SceneError
+        If the step is not a length above 0.
+
+    """
+    if not step > 0.0:
+        raise SceneError(f"the step of a ray march is a length above 0, got {step}")
+    hull = _hull(elements)
+    mesh = (elements.points, elements.scalars, elements.first, elements.corners, elements.shape, elements.across)
+    shell = (hull.corners, hull.behind, hull.first, hull.boxes, hull.root)
+
+    columns = (rays["origin"], rays["direction"], rays["reach"])
+
+    def work(rows: slice) -> tuple[Any, ...]:
+        result: tuple[Any, ...] = _march(
+            mesh, shell, elements.transfer.table, float(step), columns, row_ray[rows], row_part[rows]
+        )
+        return (result[0] + rows.start, *result[1:])
+
+    # The empty slice loads the kernel, or compiles it the first time.
+    pieces = [work(slice(0, 0)), *embree.in_chunks(work, len(row_ray))]
+    return Fragments(*(np.concatenate([piece[column] for piece in pieces]) for column in range(7)))
+
+
+# -- the boundary's hierarchy -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Hull:
+    """The boundary of every part under a binary tree over its triangles in Morton order.
+
+    Attributes
+    ----------
+    corners : float32 array (3 n, 3)
+        Positions of the triangles' corners, by part and then in Morton order.
+    behind : int32 array (n,)
+        ``16 * element + triangle`` of each.
+    first : int64 array (parts + 1,)
+        First triangle of each part.
+    boxes : float32 array (nodes, 6)
+        x, y and z of the lowest, then of the highest corner. The children of a part's node i are its nodes 2 i and
+        2 i + 1, its root is node 1, and the second half of its nodes are leaves of `_LEAF` triangles.
+    root : int64 array (parts + 1,)
+        First node of each part.
+
+    """
+
+    corners: F32
+    behind: I32
+    first: I64
+    boxes: F32
+    root: I64
+
+
+_HULLS: WeakKeyDictionary[Elements, _Hull] = WeakKeyDictionary()
+
+
+def _hull(elements: Elements) -> _Hull:
+    """Return the hierarchies of all parts, built when first asked for."""
+    if elements not in _HULLS:
+        shell = boundary(elements)
+        low, high = elements.bounds
+        middle = elements.points[shell.faces].mean(axis=1, dtype=np.float64)
+        cell = ((middle - low) / np.maximum(high - low, 1e-300) * (2**21 - 1)).astype(np.uint64)
+        code = _spread(cell[:, 0]) | _spread(cell[:, 1]) << np.uint64(1) | _spread(cell[:, 2]) << np.uint64(2)
+        order = np.lexsort((code, shell.part))
+        corners = elements.points[shell.faces[order].ravel()]
+        behind = (16 * shell.element.astype(np.int32) + shell.side)[order]
+        counts = np.bincount(shell.part, minlength=elements.parts)
+        leaves = 1 << np.ceil(np.log2(np.maximum(-(-counts // _LEAF), 1))).astype(np.int64)
+        first = np.concatenate([[0], np.cumsum(counts)])
+        root = np.concatenate([[0], np.cumsum(2 * leaves)])
+        boxes = np.empty((root[-1], 6), np.float32)
+        _boxes(corners, first, root, boxes)
+        _HULLS[elements] = _Hull(corners, behind, first, boxes, root)
+    return _HULLS[elements]
+
+
+def _spread(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Put two zeros between the 21 bits of a number."""
+    steps = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3))
+    for shift, mask in (*steps, (2, 0x1249249249249249)):
+        x = (x | x << np.uint64(shift)) & np.uint64(mask)
+    return x
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _boxes(corners, first, root, boxes):  # type: ignore[no-untyped-def]
+    """Fill the boxes of all nodes, leaves first."""
+    boxes[:, :3] = np.inf
+    boxes[:, 3:] = -np.inf
+    for part in range(len(root) - 1):
+        leaves = (root[part + 1] - root[part]) // 2
+        for face in range(first[part], first[part + 1]):
+            node = root[part] + leaves + (face - first[part]) // _LEAF
+            for j in range(3):
+                for axis in range(3):
+                    x = corners[3 * face + j, axis]
+                    boxes[node, axis] = min(boxes[node, axis], x)
+                    boxes[node, 3 + axis] = max(boxes[node, 3 + axis], x)
+        for i in range(leaves - 1, 0, -1):
+            left = root[part] + 2 * i
+            for axis in range(3):
+                boxes[root[part] + i, axis] = min(boxes[left, axis], boxes[left + 1, axis])
+                boxes[root[part] + i, 3 + axis] = max(boxes[left, 3 + axis], boxes[left + 1, 3 + axis])
+
+
+# -- exact decisions --------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _rounding(a, b, product):  # type: ignore[no-untyped-def]
+    """Return a * b - product exactly (Dekker, "A floating-point technique for extending the precision", 1971)."""
+    c, d = 134217729.0 * a, 134217729.0 * b
+    ah, bh = c - (c - a), d - (d - b)
+    al, bl = a - ah, b - bh
+    return ((ah * bh - product) + ah * bl + al * bh) + al * bl
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _tie(ax, ay, bx, by, product):  # type: ignore[no-untyped-def]
+    """Return the sign of ax by - ay bx when both products round to the same number."""
+    left, right = _rounding(ax, by, product), _rounding(ay, bx, product)
+    if left != right:
+        return 1 if left > right else -1
+    # The ray moved by (e, e^2), e infinitesimal, adds e (ay - by) + e^2 (bx - ax) to the determinant.
+    if ay != by:
+        return 1 if ay > by else -1
+    if ax != bx:
+        return 1 if bx > ax else -1
+    return 0
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _turn(ax, ay, bx, by):  # type: ignore[no-untyped-def]
+    """Return 1 if the ray, at (0, 0), has the edge from a to b turn left about it, -1 if right; 0 only for a = b.
+
+    Exact, for rounding is monotone: products that round to different numbers differ the same way.
+    """
+    p, q = ax * by, ay * bx
+    if p > q:
+        return 1
+    if p < q:
+        return -1
+    return _tie(ax, ay, bx, by, p)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _meet(v, i, j, k):  # type: ignore[no-untyped-def]
+    """Return distance and scalar where the ray passes triangle (i, j, k) of the projected corners v (9, 4)."""
+    wi = v[j, 0] * v[k, 1] - v[j, 1] * v[k, 0]
+    wj = v[k, 0] * v[i, 1] - v[k, 1] * v[i, 0]
+    wk = v[i, 0] * v[j, 1] - v[i, 1] * v[j, 0]
+    total = wi + wj + wk
+    if total == 0.0:
+        wi, wj, wk, total = 1.0, 1.0, 1.0, 3.0
+    wi, wj, wk = wi / total, wj / total, wk / total
+    return wi * v[i, 2] + wj * v[j, 2] + wk * v[k, 2], wi * v[i, 3] + wj * v[j, 3] + wk * v[k, 3]
+
+
+# -- the walk ---------------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _frame(direction):  # type: ignore[no-untyped-def]
+    """Return the axes a ray is projected along: (axis x, axis y, axis z, slope x, slope y, 1 / direction z).
+
+    z is the axis along which the ray is fastest; x and y are such that a triangle where the ray leaves turns left.
+    """
+    kz = 0
+    for axis in range(1, 3):
+        if abs(direction[axis]) > abs(direction[kz]):
+            kz = axis
+    kx, ky = (kz + 1) % 3, (kz + 2) % 3
+    dz = np.float64(direction[kz])
+    if dz < 0.0:
+        kx, ky = ky, kx
+    return kx, ky, kz, direction[kx] / dz, direction[ky] / dz, 1.0 / dz
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _project(v, i, points, point, origin, kx, ky, kz, sx, sy, inverse):  # type: ignore[no-untyped-def]
+    """Set x, y and distance in row i of v to where the ray at the origin sees a point.
+
+    They depend on the point and the ray alone, so all elements and all parts decide by the same numbers. (Numba's
+    ``float`` would leave a float32 as it is.)
+    """
+    z = np.float64(points[point, kz]) - np.float64(origin[kz])
+    v[i, 0] = (np.float64(points[point, kx]) - np.float64(origin[kx])) - sx * z
+    v[i, 1] = (np.float64(points[point, ky]) - np.float64(origin[ky])) - sy * z
+    v[i, 2] = z * inverse
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _meets_box(boxes, node, ox, oy, oz, ix, iy, iz, slack, reach):  # type: ignore[no-untyped-def]
+    """Return whether the line through o meets a box before the ray's end; i is 1 / direction, finite."""
+    if boxes[node, 0] > boxes[node, 3]:
+        return False
+    a, b = (boxes[node, 0] - slack - ox) * ix, (boxes[node, 3] + slack - ox) * ix
+    near, far = min(a, b), max(a, b)
+    a, b = (boxes[node, 1] - slack - oy) * iy, (boxes[node, 4] + slack - oy) * iy
+    near, far = max(near, min(a, b)), min(far, max(a, b))
+    a, b = (boxes[node, 2] - slack - oz) * iz, (boxes[node, 5] + slack - oz) * iz
+    near, far = max(near, min(a, b)), min(far, max(a, b))
+    return near <= far and near <= reach
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _reciprocal(x):  # type: ignore[no-untyped-def]
+    """Return 1 / x, or a number too large to matter for a box of some thickness."""
+    return 1.0 / (np.float64(x) if abs(x) > 1e-30 else 1e-30)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _entries(v, found, depth, shell, part, origin, direction, reach, frame):  # type: ignore[no-untyped-def]
+    """Find the boundary triangles of a part through which a ray's line enters it, front to back.
+
+    ``found`` and ``depth`` are where they go; they come back with the count, in larger arrays if need be. Triangles
+    behind the origin count: the ray may start inside the segment that begins there.
+    """
+    corners, _, first, boxes, root = shell
+    kx, ky, kz, sx, sy, inverse = frame
+    scale = max(abs(np.float64(origin[0])), abs(np.float64(origin[1])), abs(np.float64(origin[2])))
+    for i in range(6):
+        scale = max(scale, abs(np.float64(boxes[root[part] + 1, i])))
+    slack = _SLACK * scale
+    ox, oy, oz = np.float64(origin[0]), np.float64(origin[1]), np.float64(origin[2])
+    ix, iy, iz = _reciprocal(direction[0]), _reciprocal(direction[1]), _reciprocal(direction[2])
+    leaves = (root[part + 1] - root[part]) // 2
+    count, node = 0, 1
+    while node > 0:
+        if _meets_box(boxes, root[part] + node, ox, oy, oz, ix, iy, iz, slack, reach):
+            if node < leaves:
+                node *= 2
+                continue
+            begin = first[part] + _LEAF * (node - leaves)
+            for face in range(begin, min(begin + _LEAF, first[part + 1])):
+                for j in range(3):
+                    _project(v, j, corners, 3 * face + j, origin, kx, ky, kz, sx, sy, inverse)
+                # Seen from the ray, the triangle of an entry turns right.
+                if _turn(v[0, 0], v[0, 1], v[1, 0], v[1, 1]) >= 0:
+                    continue
+                if _turn(v[1, 0], v[1, 1], v[2, 0], v[2, 1]) >= 0 or _turn(v[2, 0], v[2, 1], v[0, 0], v[0, 1]) >= 0:
+                    continue
+                t = _meet(v, 0, 1, 2)[0]
+                if t >= reach:
+                    continue
+                if count == len(found):
+                    found, depth = np.append(found, found), np.append(depth, depth)
+                i = count
+                while i > 0 and (depth[i - 1] > t or (depth[i - 1] == t and found[i - 1] > face)):
+                    found[i], depth[i] = found[i - 1], depth[i - 1]
+                    i -= 1
+                found[i], depth[i] = face, t
+                count += 1
+        # On to the next node in preorder: up while this is a right child, then to its sibling.
+        while node & 1:
+            node >>= 1
+        node += 1 if node > 0 else 0
+    return count, found, depth
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cross(v, corner_count, shape, side, knots):  # type: ignore[no-untyped-def]
+    """Take a ray through an element, from the triangle where it enters to the one where it leaves.
+
+    Parameters
+    ----------
+    v : float64 array (9, 4)
+        The projected corners; row 8 is for their mean.
+    side : int
+        The triangle of the entry.
+    knots : float64 array (14, 2)
+        Distance and scalar at the entry, in row 0; the further triangles that the ray passes are added.
+
+    Returns
+    -------
+    side, count : int
+        The triangle of the exit and the number of knots, the last of which is there.
+
+    """
+    # The triangle behind the ray, turned such that all its edges turn left: (a, b, c); and the corner in front of it.
+    a, b, c = TRIANGLES[shape, side, 0], TRIANGLES[shape, side, 2], TRIANGLES[shape, side, 1]
+    d = 6 - a - b - c if corner_count == 4 else 8
+    ta = _turn(v[d, 0], v[d, 1], v[a, 0], v[a, 1])
+    tb = _turn(v[d, 0], v[d, 1], v[b, 0], v[b, 1])
+    tc = _turn(v[d, 0], v[d, 1], v[c, 0], v[c, 1])
+    # The way on is (a, b, d) if d lies left of b and right of a, and so around.
+    if ta > 0 and tb < 0:
+        edge = 2
+    elif tb > 0 and tc < 0:
+        a, b, edge = b, c, 1
+    else:
+        a, b, edge = c, a, 0
+    side = TURN[shape, side, edge]
+    knots[1, 0], knots[1, 1] = _meet(v, a, b, d)
+    if corner_count == 4:
+        return side, 2
+    count = 2
+    # From here on the ray is in the tetrahedron of the mean and a triangle of the surface, which has the edge (a, b).
+    while count < SIDES + 1:
+        edge = 0
+        while TRIANGLES[shape, side, edge] == a or TRIANGLES[shape, side, edge] == b:
+            edge += 1
+        d = TRIANGLES[shape, side, edge]
+        ta = _turn(v[d, 0], v[d, 1], v[a, 0], v[a, 1])
+        tb = _turn(v[d, 0], v[d, 1], v[b, 0], v[b, 1])
+        tm = _turn(v[d, 0], v[d, 1], v[8, 0], v[8, 1])
+        if ta > 0 and tb < 0:
+            break
+        # On through (b, mean, d) or (mean, a, d), into the next triangle about the mean.
+        if tb > 0 and tm < 0:
+            a = d
+        else:
+            b = d
+        # The corners of the surface's triangle follow each other as a, b, d: two of its edges are d to a and b to d.
+        side = TURN[shape, side, (edge + 2) % 3 if a == d else edge]
+        knots[count, 0], knots[count, 1] = _meet(v, a, b, 8)
+        count += 1
+    knots[count, 0], knots[count, 1] = _meet(v, a, b, d)
+    return side, count + 1
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _march(mesh, shell, table, step, rays, row_ray, row_part):  # type: ignore[no-untyped-def]
+    """March rows; return the columns of `Fragments`, the fragments' rows counted from the first of these."""
+    points, scalars, first, corners, shape, across = mesh
+    behind = shell[1]
+    origins, directions, reaches = rays
+    n = len(row_ray)
+    walked, samples, segments = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32)
+    made = 0
+    row, entry, leave = np.empty(n, np.int64), np.empty(n, np.float32), np.empty(n, np.float32)
+    rgba = np.empty((n, 4), np.float32)
+    v, knots = np.empty((9, 4)), np.empty((SIDES + 2, 2))
+    found, depth = np.empty(16, np.int64), np.empty(16)
+    control = 0
+    for i in range(n):
+        origin, direction, reach = origins[row_ray[i]], directions[row_ray[i]], np.float64(reaches[row_ray[i]])
+        frame = _frame(direction)
+        kx, ky, kz, sx, sy, inverse = frame
+        count, found, depth = _entries(v, found, depth, shell, row_part[i], origin, direction, reach, frame)
+        for s in range(count):
+            e, side = behind[found[s]] >> 4, behind[found[s]] & 15
+            start = max(depth[s], 0.0)
+            end, fresh = start, True
+            clear, red, green, blue = 1.0, 0.0, 0.0, 0.0
+            while True:
+                k = first[e + 1] - first[e]
+                for j in range(k):
+                    _project(v, j, points, corners[first[e] + j], origin, kx, ky, kz, sx, sy, inverse)
+                    v[j, 3] = scalars[corners[first[e] + j]]
+                if fresh:
+                    a, b, c = TRIANGLES[shape[e], side, 0], TRIANGLES[shape[e], side, 1], TRIANGLES[shape[e], side, 2]
+                    knots[0, 0], knots[0, 1] = _meet(v, a, b, c)
+                    fresh = False
+                if k > 4:
+                    for axis in range(4):
+                        total = 0.0
+                        for j in range(k):
+                            total += v[j, axis]
+                        v[8, axis] = total / k
+                side, last = _cross(v, k, shape[e], side, knots)
+                # Rounding must not make a ray step back.
+                for j in range(1, last):
+                    knots[j, 0] = max(knots[j, 0], knots[j - 1, 0])
+                low, high = max(knots[0, 0], 0.0), min(knots[last - 1, 0], reach)
+                if knots[last - 1, 0] > 0.0 and low < reach:
+                    walked[i] += 1
+                    end = high
+                    if high > low:
+                        takes = max(1, math.ceil((high - low) / step))
+                        share = (high - low) / takes
+                        samples[i] += takes
+                        j = 1
+                        for m in range(takes):
+                            t = low + (m + 0.5) * share
+                            while j < last - 1 and knots[j, 0] < t:
+                                j += 1
+                            width = knots[j, 0] - knots[j - 1, 0]
+                            f = min(max((t - knots[j - 1, 0]) / width, 0.0), 1.0) if width > 0.0 else 0.0
+                            value = knots[j - 1, 1] + f * (knots[j, 1] - knots[j - 1, 1])
+                            control = find_row(table, value, control)
+                            x = max(value - table[control, 0], 0.0)
+                            sigma = table[control, 1] + x * table[control, 2]
+                            if sigma > 0.0:
+                                weight = -clear * math.expm1(-sigma * share)
+                                clear -= weight
+                                red += weight * (table[control, 3] + x * table[control, 4])
+                                green += weight * (table[control, 5] + x * table[control, 6])
+                                blue += weight * (table[control, 7] + x * table[control, 8])
+                beyond = across[2 * first[e] - 4 * e + side]
+                if beyond < 0 or knots[last - 1, 0] >= reach:
+                    break
+                knots[0, 0], knots[0, 1] = knots[last - 1, 0], knots[last - 1, 1]
+                e, side = beyond >> 4, beyond & 15
+            if end > start:
+                segments[i] += 1
+            if clear < 1.0:
+                if made == len(row):
+                    row, entry, leave = np.append(row, row), np.append(entry, entry), np.append(leave, leave)
+                    rgba = np.concatenate((rgba, rgba))
+                row[made], entry[made], leave[made] = i, start, end
+                rgba[made, 0], rgba[made, 1], rgba[made, 2], rgba[made, 3] = red, green, blue, 1.0 - clear
+                made += 1
+    return row[:made], entry[:made], leave[:made], rgba[:made], walked, samples, segments
