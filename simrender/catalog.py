@@ -25,6 +25,11 @@ from simrender.errors import CardError, UnknownNameError, UsageError
 
 Kind = Literal["machine", "workload"]
 
+SCENE_ENDINGS: Final = (
+    ".ply", ".obj", ".glb", ".gltf", ".stl", ".spray", ".npy", ".nrrd", ".nhdr", ".raw", ".vti", ".vtr", ".vtu", ".vtk",
+)  # fmt: skip
+"""Of the files of `simrender.rays.files`, for messages."""
+
 CARD_ENDINGS: Final = (".yaml", ".yml", "")
 """Endings of card files; a pipe has none."""
 
@@ -216,8 +221,8 @@ def find_card(kind: Kind | None, name: str, folder: Path | None = None) -> CardF
         if path.is_dir():
             raise UsageError(f"{base}: this is a folder, expected the card of a {what}, such as {path / 'card.yaml'}")
         if path.suffix.lower() not in CARD_ENDINGS:
-            mesh = "; a mesh ends in .ply, .obj, .glb, .gltf or .stl" if kind == "workload" else ""
-            raise UsageError(f"{base}: expected the card of a {what}, a file that ends in .yaml or .yml{mesh}")
+            scene = f"; a scene ends in {', '.join(SCENE_ENDINGS)}" if kind == "workload" else ""
+            raise UsageError(f"{base}: expected the card of a {what}, a file that ends in .yaml or .yml{scene}")
         if not path.is_file():
             raise UnknownNameError(what, base, known, "there is no such file either")
         return CardFile(path.stem if path.stem != "card" else path.resolve().parent.name, path, kind, variant)

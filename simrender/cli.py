@@ -255,7 +255,9 @@ def _domains_card(card: DomainsCard | None, partition: str | None, domains: str 
         return DomainsCard(**fields)
     except ValidationError as error:
         words = str(error.errors()[0]["msg"]).removeprefix("Value error, ")
-        given = " ".join(f"--{name} {value}" for name, value in (("partition", partition), ("domains", domains)) if value)
+        given = " ".join(
+            f"--{name} {value}" for name, value in (("partition", partition), ("domains", domains)) if value
+        )
         raise UsageError(f"{given}: {words} (count and shape are given by --domains)") from None
 
 
@@ -298,7 +300,7 @@ def _write_picture(
             group = morton_ranks(crossings.domains.low, crossings.domains.high, ranks)
         write_image(path, pictures.domain_picture(rays, crossings, group))
     elif show == "work":
-        write_figure(path, pictures.plot_work(name, rays))
+        write_figure(path, pictures.plot_work(name, rays, crossings))
     elif picture is not None:
         write_figure(path, pictures.plot_error(name, picture))
 

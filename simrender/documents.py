@@ -334,9 +334,12 @@ class Document:
 
     def _path(self, error: Any) -> tuple[Path, str]:
         """Return where in the document a mistake is, and what kind it is of."""
-        path: Path = tuple(p for p in error["loc"] if not (isinstance(p, str) and p.startswith("<")))
         kind: str = error["type"]
-        if kind not in _MISSING and not self._has(path):
+        place = error["loc"]
+        named = len(place) - 1 if kind in {"extra_forbidden", "unexpected_keyword_argument"} else -1
+        # pydantic names validators in angle brackets; an unknown field may be called so too.
+        path: Path = tuple(p for i, p in enumerate(place) if i == named or not str(p).startswith("<"))
+        if path and kind not in _MISSING and not self._has(path):
             return path[:-1], "union"  # the last part names a branch
         return path, kind
 

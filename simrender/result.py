@@ -168,7 +168,7 @@ def breakdown(timeline: Timeline, frame_time_s: float) -> dict[str, float]:
 
 def counts(frame: Frame, machine: Machine) -> dict[str, float]:
     """Return how much of everything there was."""
-    trace, weight = frame.trace, frame.weight
+    trace, weight = frame.trace, frame.weight * frame.repeats
     kinds = np.bincount(trace.column("kind"), minlength=len(KINDS))
     occluded = int(np.isfinite(trace.column("t")[trace.column("kind") == SHADOW]).sum())
     log = frame.timeline

@@ -19,6 +19,7 @@ from simrender.hardware.machine import Machine, MachineCard, check_processors, l
 from simrender.policies.frame import Frame, Policy
 from simrender.policies.islands import Fit, Layout, fit
 from simrender.policies.rank import PIXEL_BYTES, Rank
+from simrender.rays.integrators import PathTracing
 from simrender.rays.partition import Footprint, Partition
 from simrender.rays.trace import Progress, Trace
 from simrender.rays.workload import Workload, check_seed, load_workload
@@ -87,6 +88,12 @@ def simulate(
     if isinstance(workload, str):
         workload = load_workload(workload, given.get("workload", ()), cache)
     name, scheduler = _policy(policy, workload, given.get("policy", ()))
+    if not isinstance(workload.integrator, PathTracing):
+        other = workload.card.integrator.name
+        hint = "; --set workload.integrator.name=path_tracing" if len(workload.scene.instance_object) else ""
+        raise UsageError(
+            f"{name} moves the rays of path_tracing, and the integrator of {workload.name} is {other}{hint}"
+        )
     noun = card.processor_noun
     if scheduler.replicated and islands not in {"auto", count}:
         raise UsageError(
@@ -124,7 +131,7 @@ def simulate(
     frame = Frame(
         env, devices, layout, trace, partition, scheduler, Timeline(layout.ranks, names),
         visited=lambda generation, start: workload.crossings(seed, partition).domains_visited(generation, start),
-        weight=workload.weight, published=workload.card.published.resolution,
+        weight=workload.weight, published=workload.card.published.resolution, repeats=workload.repeats,
     )  # fmt: skip
     cases, which = _buffers(scheduler, workload, layout)
     ranks = []
@@ -139,9 +146,9 @@ def simulate(
 
     trace.complete()
     retired = np.concatenate(frame.retired)
-    _check_retired(trace, retired)
+    _check_retired(trace, retired, frame.repeats)
     _check_devices(frame, int(env.now))
-    image = trace.image(np.sort(retired))
+    image = trace.image(np.unique(retired))
     image_sha256 = _hash(image)
     if image_sha256 != _hash(trace.reference):
         raise InvariantError(f"{name} rendered another image than the reference renderer")
@@ -255,10 +262,10 @@ def _buffers(policy: Policy, workload: Workload, layout: Layout) -> tuple[list[d
     return cases, which
 
 
-def _check_retired(trace: Trace, retired: NDArray[np.int64]) -> None:
+def _check_retired(trace: Trace, retired: NDArray[np.int64], repeats: int) -> None:
     times = np.bincount(retired, minlength=trace.rays)
-    if len(times) > trace.rays or not (times == 1).all():
-        lost, repeated = int((times == 0).sum()), int((times > 1).sum())
+    if len(times) > trace.rays or not (times == repeats).all():
+        lost, repeated = int((times < repeats).sum()), int((times > repeats).sum())
         raise InvariantError(f"of {trace.rays} rays {lost} were never retired and {repeated} more than once")
 
 

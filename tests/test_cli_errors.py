@@ -128,10 +128,11 @@ def test_a_mesh_that_is_not_there(bad, tmp_path, tiny_card):
 def test_a_mesh_of_an_unknown_ending(bad, tmp_path, tiny_card):
     (tmp_path / "scene.abc").write_text("x")
     message = bad("run", "dgx2", tmp_path / "scene.abc")
-    assert message.endswith("ends in .yaml or .yml; a mesh ends in .ply, .obj, .glb, .gltf or .stl")
+    assert "ends in .yaml or .yml; a scene ends in .ply, .obj, .glb, .gltf, .stl, .spray, .npy" in message
     tiny_card.write_text(tiny_card.read_text().replace("bumpy.ply", "scene.abc"))
     assert bad("run", "dgx2", tiny_card) == (
-        f"{tmp_path / 'scene.abc'}: unknown mesh format '.abc' (known: .ply, .obj, .glb, .gltf, .stl)"
+        f"{tmp_path / 'scene.abc'}: unknown scene format '.abc' (known: .ply, .obj, .glb, .gltf, .stl, .spray, "
+        ".npy, .nrrd, .nhdr, .raw, .vti, .vtr, .vtu, .vtk)"
     )
 
 
@@ -363,7 +364,7 @@ def test_the_image_of_a_trace_is_checked_too(bad, tiny_card, tmp_path):
 
 
 def test_a_workload_too_large_for_this_computer(run_cli, tiny_card, monkeypatch):
-    def exhausted(*_):
+    def exhausted(*_, **__):
         raise MemoryError("Unable to allocate 74.5 GiB")
 
     monkeypatch.setattr("simrender.rays.shading.camera_rays", exhausted)

@@ -144,7 +144,9 @@ class Frame:
     visited : callable
         (generation, first domain of each pixel's rays) -> int16 array: how many domains each ray is traced in.
     weight : float
-        Published rays for which a traced ray stands.
+        Published rays of a wave for which a traced ray stands.
+    repeats : int
+        Published samples a pixel for which a traced one stands: each wave comes so many times.
     published : (width, height)
         Pixels of the published image.
     wave_mean, wave_excess : float
@@ -163,6 +165,7 @@ class Frame:
     visited: Callable[[int, NDArray[np.int64]], NDArray[np.int16]]
     weight: float
     published: tuple[int, int]
+    repeats: int = 1
     outbox: dict[tuple[int, int], RayQueue] = field(default_factory=dict)
     retired: list[Ids] = field(default_factory=list)
     tests: int = 0

@@ -54,7 +54,7 @@ class Rank:
         layout = frame.layout
         self.domain, self.island_size = layout.domain(index), layout.size
         self.left, self.right = layout.left(index), layout.right(index)
-        self.samples = frame.trace.samples
+        self.samples = frame.trace.samples * frame.repeats
         self._pixels = frame.pixels_of[index]
         self._shifts = 0
 
@@ -68,7 +68,7 @@ class Rank:
         """Write a wave of camera rays, one a pixel of this rank, into the queue behind the rays already there."""
         yield from self._turn()
         frame = self._frame
-        rays = frame.trace.camera_rays(sample, self._pixels)
+        rays = frame.trace.camera_rays(sample % frame.trace.samples, self._pixels)
         self._kernel(GENERATE, len(rays) * frame.policy.ray_bytes * frame.weight, len(rays) * frame.weight)
         return self._queue(np.concatenate([behind.ids, rays]) if len(behind) else rays)
 

@@ -265,7 +265,8 @@ def _through_boxes(  # type: ignore[no-untyped-def]
     leaves = len(leaf) - 1
     for i in range(len(reach)):
         ox, oy, oz = np.float64(origin[i, 0]), np.float64(origin[i, 1]), np.float64(origin[i, 2])
-        ix, iy, iz = inverse(np.float64(direction[i, 0])), inverse(np.float64(direction[i, 1])), inverse(np.float64(direction[i, 2]))
+        dx, dy, dz = np.float64(direction[i, 0]), np.float64(direction[i, 1]), np.float64(direction[i, 2])
+        ix, iy, iz = inverse(dx), inverse(dy), inverse(dz)
         far = np.float64(reach[i])
         found = 0
         node = 1
@@ -314,7 +315,8 @@ def _through_grid(origin, direction, reach, count, growth, xs, ys, zs, first, do
     nx, ny, nz = len(xs) - 1, len(ys) - 1, len(zs) - 1
     for i in range(len(reach)):
         ox, oy, oz = np.float64(origin[i, 0]), np.float64(origin[i, 1]), np.float64(origin[i, 2])
-        ix, iy, iz = inverse(np.float64(direction[i, 0])), inverse(np.float64(direction[i, 1])), inverse(np.float64(direction[i, 2]))
+        dx, dy, dz = np.float64(direction[i, 0]), np.float64(direction[i, 1]), np.float64(direction[i, 2])
+        ix, iy, iz = inverse(dx), inverse(dy), inverse(dz)
         end = np.float64(reach[i])
         # The slack of the whole grid's box is at least that of each cell's, and no less than what keeps the walk's own
         # roundings from missing a cell.

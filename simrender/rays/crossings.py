@@ -150,7 +150,7 @@ class Crossings:
             local = np.flatnonzero((trace.column("kind")[begin:end] == SHADOW) & np.isfinite(t))
             geometry = tuple(column[local] for column in geometry)
             t, primitive = t[local], primitive[local]
-        # Boxes as they are: a hit that float32 lets lie outside its domain's box is the nearest one, or does not matter.
+        # Boxes as they are: a hit that float32 lets lie outside its box is the nearest one, or does not matter.
         if domains.planes is not None:
             entered = walk_grid(*geometry, domains.planes, growth=0.0)
         else:
@@ -182,7 +182,11 @@ class Crossings:
 
 
 def _with_nearest(
-    first: Ids, domain: NDArray[np.int16], entry: NDArray[np.float32], nearest: NDArray[np.int16], t: NDArray[np.float32]
+    first: Ids,
+    domain: NDArray[np.int16],
+    entry: NDArray[np.float32],
+    nearest: NDArray[np.int16],
+    t: NDArray[np.float32],
 ) -> tuple[Ids, NDArray[np.int16], NDArray[np.float32]]:
     """Add the row of each ray's nearest hit where the ray passes by its domain's box by a rounding."""
     missing = _without_nearest(first, domain, nearest)

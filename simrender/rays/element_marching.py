@@ -36,8 +36,8 @@ F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 
-_LEAF = 4
-"""Triangles in a leaf of the boundary's hierarchy."""
+_LEAF = 3
+"""The most triangles in a leaf of the boundary's hierarchy."""
 
 _SLACK = 1e-9
 """How much its boxes are grown, relative to the coordinates: far above rounding in float64, far below a triangle."""
@@ -120,19 +120,19 @@ def march_parts(
 
 @dataclass(frozen=True, eq=False)
 class _Hull:
-    """The boundary of every part under a binary tree over its triangles in Morton order.
+    """The boundary of every part under a binary tree, complete and parted at medians.
 
     Attributes
     ----------
     corners : float32 array (3 n, 3)
-        Positions of the triangles' corners, by part and then in Morton order.
+        Positions of the triangles' corners, by part and in the order of the leaves.
     behind : int32 array (n,)
         ``16 * element + triangle`` of each.
     first : int64 array (parts + 1,)
         First triangle of each part.
     boxes : float32 array (nodes, 6)
         x, y and z of the lowest, then of the highest corner. The children of a part's node i are its nodes 2 i and
-        2 i + 1, its root is node 1, and the second half of its nodes are leaves of `_LEAF` triangles.
+        2 i + 1, its root is node 1, and the second half of its nodes are leaves with equal shares of the triangles.
     root : int64 array (parts + 1,)
         First node of each part.
 
@@ -152,50 +152,72 @@ def _hull(elements: Elements) -> _Hull:
     """Return the hierarchies of all parts, built when first asked for."""
     if elements not in _HULLS:
         shell = boundary(elements)
-        low, high = elements.bounds
-        middle = elements.points[shell.faces].mean(axis=1, dtype=np.float64)
-        cell = ((middle - low) / np.maximum(high - low, 1e-300) * (2**21 - 1)).astype(np.uint64)
-        code = _spread(cell[:, 0]) | _spread(cell[:, 1]) << np.uint64(1) | _spread(cell[:, 2]) << np.uint64(2)
-        order = np.lexsort((code, shell.part))
-        corners = elements.points[shell.faces[order].ravel()]
-        behind = (16 * shell.element.astype(np.int32) + shell.side)[order]
         counts = np.bincount(shell.part, minlength=elements.parts)
-        leaves = 1 << np.ceil(np.log2(np.maximum(-(-counts // _LEAF), 1))).astype(np.int64)
-        first = np.concatenate([[0], np.cumsum(counts)])
-        root = np.concatenate([[0], np.cumsum(2 * leaves)])
-        boxes = np.empty((root[-1], 6), np.float32)
-        _boxes(corners, first, root, boxes)
-        _HULLS[elements] = _Hull(corners, behind, first, boxes, root)
+        leaves = 1 << np.ceil(np.log2(np.maximum(counts / _LEAF, 1.0))).astype(np.int64)
+        first, root = np.concatenate([[0], np.cumsum(counts)]), np.concatenate([[0], np.cumsum(2 * leaves)])
+        order, boxes = np.argsort(shell.part, kind="stable"), np.empty((root[-1], 6), np.float32)
+        corners = elements.points[shell.faces]
+        _build(corners.min(axis=1), corners.max(axis=1), first, root, order, boxes)
+        behind = (16 * shell.element + shell.side)[order]
+        _HULLS[elements] = _Hull(corners[order].reshape(-1, 3), behind, first, boxes, root)
     return _HULLS[elements]
 
 
-def _spread(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Put two zeros between the 21 bits of a number."""
-    steps = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3))
-    for shift, mask in (*steps, (2, 0x1249249249249249)):
-        x = (x | x << np.uint64(shift)) & np.uint64(mask)
-    return x
-
-
 @njit(cache=True, nogil=True, error_model="numpy")
-def _boxes(corners, first, root, boxes):  # type: ignore[no-untyped-def]
-    """Fill the boxes of all nodes, leaves first."""
-    boxes[:, :3] = np.inf
-    boxes[:, 3:] = -np.inf
+def _build(low, high, first, root, order, boxes):  # type: ignore[no-untyped-def]
+    """Order the triangles of every part for its tree, whose nodes part them at the median, and fill the nodes' boxes.
+
+    Parameters
+    ----------
+    low, high : float32 arrays (n, 3)
+        Boxes of the triangles.
+    first, root : int64 arrays (parts + 1,)
+        As in `_Hull`.
+    order : int64 array (n,)
+        The triangles, part by part; reordered.
+    boxes : float32 array (nodes, 6)
+        To be filled.
+
+    """
     for part in range(len(root) - 1):
-        leaves = (root[part + 1] - root[part]) // 2
-        for face in range(first[part], first[part + 1]):
-            node = root[part] + leaves + (face - first[part]) // _LEAF
-            for j in range(3):
-                for axis in range(3):
-                    x = corners[3 * face + j, axis]
-                    boxes[node, axis] = min(boxes[node, axis], x)
-                    boxes[node, 3 + axis] = max(boxes[node, 3 + axis], x)
-        for i in range(leaves - 1, 0, -1):
-            left = root[part] + 2 * i
-            for axis in range(3):
-                boxes[root[part] + i, axis] = min(boxes[left, axis], boxes[left + 1, axis])
-                boxes[root[part] + i, 3 + axis] = max(boxes[left, 3 + axis], boxes[left + 1, 3 + axis])
+        leaves, count = (root[part + 1] - root[part]) // 2, first[part + 1] - first[part]
+        width = leaves
+        while width > 0:
+            for i in range(leaves // width):
+                begin = first[part] + i * width * count // leaves
+                end = first[part] + (i + 1) * width * count // leaves
+                axis, extent = 0, np.float32(-1.0)
+                node = root[part] + leaves // width + i
+                for x in range(3):
+                    least, most = np.float32(np.inf), np.float32(-np.inf)
+                    for j in range(begin, end):
+                        least, most = min(least, low[order[j], x]), max(most, high[order[j], x])
+                    boxes[node, x], boxes[node, 3 + x] = least, most
+                    if most - least > extent:
+                        axis, extent = x, most - least
+                if width == 1:
+                    continue
+                # Quickselect along the widest axis: afterwards what comes before the split lies before it.
+                split = first[part] + (2 * i + 1) * (width // 2) * count // leaves
+                a, b = begin, end - 1
+                while a < b:
+                    pivot = low[order[(a + b) // 2], axis] + high[order[(a + b) // 2], axis]
+                    left, right = a, b
+                    while left <= right:
+                        while low[order[left], axis] + high[order[left], axis] < pivot:
+                            left += 1
+                        while low[order[right], axis] + high[order[right], axis] > pivot:
+                            right -= 1
+                        if left <= right:
+                            order[left], order[right] = order[right], order[left]
+                            left, right = left + 1, right - 1
+                    if split <= right:
+                        b = right
+                    elif split >= left:
+                        a = left
+                    else:
+                        break
+            width //= 2
 
 
 # -- exact decisions --------------------------------------------------------------------------------------------------
@@ -285,20 +307,6 @@ def _project(v, i, points, point, origin, kx, ky, kz, sx, sy, inverse):  # type:
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _meets_box(boxes, node, ox, oy, oz, ix, iy, iz, slack, reach):  # type: ignore[no-untyped-def]
-    """Return whether the line through o meets a box before the ray's end; i is 1 / direction, finite."""
-    if boxes[node, 0] > boxes[node, 3]:
-        return False
-    a, b = (boxes[node, 0] - slack - ox) * ix, (boxes[node, 3] + slack - ox) * ix
-    near, far = min(a, b), max(a, b)
-    a, b = (boxes[node, 1] - slack - oy) * iy, (boxes[node, 4] + slack - oy) * iy
-    near, far = max(near, min(a, b)), min(far, max(a, b))
-    a, b = (boxes[node, 2] - slack - oz) * iz, (boxes[node, 5] + slack - oz) * iz
-    near, far = max(near, min(a, b)), min(far, max(a, b))
-    return near <= far and near <= reach
-
-
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _reciprocal(x):  # type: ignore[no-untyped-def]
     """Return 1 / x, or a number too large to matter for a box of some thickness."""
     return 1.0 / (np.float64(x) if abs(x) > 1e-30 else 1e-30)
@@ -316,18 +324,26 @@ def _entries(v, found, depth, shell, part, origin, direction, reach, frame):  # 
     scale = max(abs(np.float64(origin[0])), abs(np.float64(origin[1])), abs(np.float64(origin[2])))
     for i in range(6):
         scale = max(scale, abs(np.float64(boxes[root[part] + 1, i])))
-    slack = _SLACK * scale
-    ox, oy, oz = np.float64(origin[0]), np.float64(origin[1]), np.float64(origin[2])
     ix, iy, iz = _reciprocal(direction[0]), _reciprocal(direction[1]), _reciprocal(direction[2])
-    leaves = (root[part + 1] - root[part]) // 2
+    # The sides of boxes where the ray enters and leaves, and the origin moved away from them: that grows the boxes.
+    nx, ny, nz = 0 if ix > 0.0 else 3, 1 if iy > 0.0 else 4, 2 if iz > 0.0 else 5
+    fx, fy, fz = 3 - nx, 5 - ny, 7 - nz
+    gx, gy, gz = math.copysign(_SLACK * scale, ix), math.copysign(_SLACK * scale, iy), math.copysign(_SLACK * scale, iz)
+    nox, noy, noz = origin[0] + gx, origin[1] + gy, origin[2] + gz
+    fox, foy, foz = origin[0] - gx, origin[1] - gy, origin[2] - gz
+    base, leaves, triangles = root[part], (root[part + 1] - root[part]) // 2, first[part + 1] - first[part]
     count, node = 0, 1
     while node > 0:
-        if _meets_box(boxes, root[part] + node, ox, oy, oz, ix, iy, iz, slack, reach):
+        row = base + node
+        near = max((boxes[row, nx] - nox) * ix, (boxes[row, ny] - noy) * iy, (boxes[row, nz] - noz) * iz)
+        far = min((boxes[row, fx] - fox) * ix, (boxes[row, fy] - foy) * iy, (boxes[row, fz] - foz) * iz)
+        if near <= far and near <= reach:
             if node < leaves:
                 node *= 2
                 continue
-            begin = first[part] + _LEAF * (node - leaves)
-            for face in range(begin, min(begin + _LEAF, first[part + 1])):
+            begin = first[part] + (node - leaves) * triangles // leaves
+            end = first[part] + (node - leaves + 1) * triangles // leaves
+            for face in range(begin, end):
                 for j in range(3):
                     _project(v, j, corners, 3 * face + j, origin, kx, ky, kz, sx, sy, inverse)
                 # Seen from the ray, the triangle of an entry turns right.

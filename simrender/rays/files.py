@@ -12,7 +12,7 @@ from simrender.errors import SceneError
 from simrender.rays import meshes
 from simrender.rays.scene import Environment, Scene
 
-VOLUMES = (".npy", ".nrrd", ".nhdr", ".raw", ".vti")
+VOLUMES = (".npy", ".nrrd", ".nhdr", ".raw", ".vti", ".vtr")
 ELEMENTS = (".vtu",)
 FORMATS = (*meshes.FORMATS, ".spray", *VOLUMES, *ELEMENTS, ".vtk")
 """Endings of the files that are read."""

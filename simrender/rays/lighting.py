@@ -46,7 +46,7 @@ def shade(
     }
     radiance, children = np.zeros((n, 3), np.float32), np.zeros(n, np.uint16)
     spawned = _light(
-        rays["origin"], rays["direction"], rays["throughput"], rays["pixel"], rays["sample"], rays["kind"],
+        rays["direction"], rays["throughput"], rays["pixel"], rays["sample"], rays["kind"],
         rays["diffuse"], hits.primitive, hits.u, hits.v,
         surfaces.vertices, surfaces.faces, surfaces.normals, surfaces.colors, surfaces.material, surfaces.materials,
         surfaces.points, surfaces.hemispheres, surfaces.light_first, surfaces.light_rows,
@@ -64,7 +64,7 @@ def shade(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _light(  # type: ignore[no-untyped-def]
-    origin, direction, throughput, pixel, sample, kind, depth, primitive, u, v,
+    direction, throughput, pixel, sample, kind, depth, primitive, u, v,
     vertices, faces, normals, colors, material_of, materials, points, hemispheres, light_first, light_rows,
     ambient, each, distance, specular, shininess, bounces, seed,
     radiance, children, out_origin, out_bits, out_direction, out_throughput, out_reach, out_parent, out_kind,
@@ -84,7 +84,18 @@ def _light(  # type: ignore[no-untyped-def]
             continue
         dx, dy, dz = np.float64(direction[i, 0]), np.float64(direction[i, 1]), np.float64(direction[i, 2])
         px, py, pz, gx, gy, gz, sx, sy, sz, ar, ag, ab = surface_point(
-            primitive[i], np.float64(u[i]), np.float64(v[i]), dx, dy, dz, vertices, faces, normals, colors, material_of, materials
+            primitive[i],
+            np.float64(u[i]),
+            np.float64(v[i]),
+            dx,
+            dy,
+            dz,
+            vertices,
+            faces,
+            normals,
+            colors,
+            material_of,
+            materials,
         )
         if gx == 0.0 and gy == 0.0 and gz == 0.0:
             continue  # a degenerate triangle has no side to scatter to
@@ -178,7 +189,11 @@ def _light(  # type: ignore[no-untyped-def]
                 # The light's own surface must not shadow it: aim at a point moved off it, from a moved origin.
                 out_origin[n_out, 0], out_origin[n_out, 1], out_origin[n_out, 2] = qx, qy, qz
                 offset_origin(out_origin, out_bits, n_out, mx, my, mz)
-                qx, qy, qz = np.float64(out_origin[n_out, 0]), np.float64(out_origin[n_out, 1]), np.float64(out_origin[n_out, 2])
+                qx, qy, qz = (
+                    np.float64(out_origin[n_out, 0]),
+                    np.float64(out_origin[n_out, 1]),
+                    np.float64(out_origin[n_out, 2]),
+                )
             out_origin[n_out, 0], out_origin[n_out, 1], out_origin[n_out, 2] = px, py, pz
             offset_origin(out_origin, out_bits, n_out, side * gx, side * gy, side * gz)
             if lit:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from simrender.errors import SceneError
 from simrender.rays import embree
-from simrender.rays.volume import Volume, find_row, interpolate
+from simrender.rays.volume import Volume, check_bricks, find_row, interpolate
 
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
@@ -92,7 +92,8 @@ def march(
     Raises
     ------
     SceneError
-        If the step is not a length above 0, or so small that a ray's samples could not be counted.
+        If the step is not a length above 0, or so small that a ray's samples could not be counted; if a brick does not
+        consist of whole macro cells of the volume.
 
     """
     spacing, origin = np.array(volume.spacing), np.array(volume.origin)
@@ -100,6 +101,7 @@ def march(
     if not (math.isfinite(step) and step > diagonal / 2**31):
         least = f"above {diagonal / 2**31:.3g}, the volume's diagonal over 2^31"
         raise SceneError(f"the step of a ray march is a length {least}, got {step}")
+    check_bricks(volume, row_cells)
     n = len(row_ray)
     low, high = volume.value_range
     out = Marched(

@@ -340,6 +340,7 @@ class Scene:
 
     def scaled(self, factor: float) -> Scene:
         """Return the scene in other units of length: every length times a factor, radiance as it is."""
+
         def times(triple: tuple[float, float, float], by: float) -> tuple[float, float, float]:
             return triple[0] * by, triple[1] * by, triple[2] * by
 

@@ -145,8 +145,8 @@ def shade(rays: dict[str, Any], hits: Any, surfaces: Surfaces, path: PathTracing
     spawned = _shade(
         rays["direction"], rays["throughput"], rays["pixel"], rays["sample"], rays["kind"], rays["diffuse"],
         rays["mirror"], hits.primitive, hits.u, hits.v,
-        surfaces.vertices, surfaces.faces, surfaces.normals, surfaces.colors, surfaces.material, surfaces.materials, surfaces.sky, surfaces.points,
-        surfaces.light_first, surfaces.light_rows,
+        surfaces.vertices, surfaces.faces, surfaces.normals, surfaces.colors, surfaces.material, surfaces.materials,
+        surfaces.sky, surfaces.points, surfaces.light_first, surfaces.light_rows,
         path.diffuse, path.mirror, path.roulette, seed,
         radiance, children, out["origin"], out["origin"].view(np.int32), out["direction"], out["throughput"],
         out["reach"], out["parent"], out["kind"],
@@ -232,7 +232,18 @@ def _shade(  # type: ignore[no-untyped-def]
             continue
 
         px, py, pz, gx, gy, gz, nx, ny, nz, ar, ag, ab = surface_point(
-            primitive[i], np.float64(u[i]), np.float64(v[i]), dx, dy, dz, vertices, faces, normals, colors, material_of, materials
+            primitive[i],
+            np.float64(u[i]),
+            np.float64(v[i]),
+            dx,
+            dy,
+            dz,
+            vertices,
+            faces,
+            normals,
+            colors,
+            material_of,
+            materials,
         )
         if gx == 0.0 and gy == 0.0 and gz == 0.0:
             continue  # a degenerate triangle has no side to scatter to

@@ -24,8 +24,8 @@ FORMAT_VERSION = 3
 
 
 _TRANSPORT = (
-    "scene", "shading", "lighting", "sampling", "volume", "marching", "tracking", "volume_paths", "elements", "element_marching",
-    "compositing", "worlds",
+    "scene", "shading", "lighting", "sampling", "volume", "marching", "tracking", "volume_paths", "elements",
+    "element_marching", "compositing", "worlds",
 )  # fmt: skip
 """The modules that decide what is stored."""
 

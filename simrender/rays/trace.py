@@ -149,7 +149,10 @@ class Trace:
     def column(self, name: str) -> Any:
         """Return an outcome column over all generations known so far, one row a ray."""
         if name not in self._joined:
-            self._joined[name] = np.concatenate([g[name] for g in self._outcomes])
+            parts = [g[name] for g in self._outcomes]
+            self._joined[name] = whole = parts[0] if len(parts) == 1 else np.concatenate(parts)
+            for g, begin, end in zip(self._outcomes, self.first, self.first[1:], strict=False):
+                g[name] = whole[begin:end]  # so that nothing is held twice
         return self._joined[name]
 
     @property
@@ -278,14 +281,19 @@ class Trace:
     def _first_rays(self) -> Columns:
         from simrender.rays import shading
 
-        cast = embree.on_all_cores(
-            lambda sample: shading.camera_rays(self.camera, self.size, self.seed, sample, jitter=self.jitter),
-            range(self.samples),
-        )
         n = self.pixels * self.samples
+        origin, direction = np.empty((n, 3), np.float32), np.empty((n, 3), np.float32)
+
+        def cast(sample: int) -> None:
+            rows = slice(sample * self.pixels, (sample + 1) * self.pixels)
+            origin[rows], direction[rows] = shading.camera_rays(
+                self.camera, self.size, self.seed, sample, jitter=self.jitter
+            )
+
+        embree.on_all_cores(cast, range(self.samples))
         return {
-            "origin": np.concatenate([o for o, _ in cast]),
-            "direction": np.concatenate([d for _, d in cast]),
+            "origin": origin,
+            "direction": direction,
             "reach": np.full(n, np.inf, np.float32),
             "throughput": np.ones((n, 3), np.float32),
             "pixel": np.tile(np.arange(self.pixels, dtype=np.int32), self.samples),

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from simrender.rays import embree
 from simrender.rays.sampling import path_key, uniform
-from simrender.rays.volume import MACRO, Volume, find_row, interpolate
+from simrender.rays.volume import MACRO, Volume, check_bricks, find_row, interpolate
 
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
@@ -96,7 +96,13 @@ def track(
     majorant_scale : float
         Factor >= 1 on all majorants: more null collisions, the same distribution of the real ones.
 
+    Raises
+    ------
+    SceneError
+        If a brick does not consist of whole macro cells of the volume.
+
     """
+    check_bricks(volume, row_cells)
     n = len(row_ray)
     out = Tracked(
         np.full(n, np.inf, np.float32),

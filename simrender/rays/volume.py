@@ -3,9 +3,9 @@
 Voxels are samples at grid *points*, as in VTK's image data; a *cell* lies between eight of them and its field is their
 trilinear interpolant. Cells are indexed 0 .. n - 2 along an axis of n points. A *macro cell* is a block of up to
 `MACRO` cells a side with the range of values in it and the largest extinction these can have, its *majorant*: what
-lets a ray stride through empty space (Guenther et al. as cited in the islands paper, section 6). A *brick* is a box
-of cells, an int32 row (x0, x1, y0, y1, z0, z1) of the cells x0 <= i < x1 and so on; its faces lie on faces of macro
-cells or on the volume's own.
+lets a ray stride through empty space (Guenther, Kuhn and Theisel, "MCFTLE: Monte Carlo rendering of finite-time
+Lyapunov exponent fields", Computer Graphics Forum 35(3), 2016; islands paper, section 6). A *brick* is a box of whole
+macro cells, an int32 row (x0, x1, y0, y1, z0, z1) of the cells x0 <= i < x1 and so on.
 
 Numba keeps a compiled kernel until the kernel's own file changes: whoever edits the jitted functions here must touch
 ``marching.py`` and ``tracking.py`` too.
@@ -251,6 +251,18 @@ class Volume:
         for entries in (self.transfer.values, self.transfer.colors, self.transfer.opacities):
             digest.update(entries.tobytes())
         return digest.hexdigest()
+
+
+def check_bricks(volume: Volume, bricks: I32) -> None:
+    """Raise a `SceneError` unless each brick, int32 (n, 6), consists of whole macro cells of the volume."""
+    low, high, cells = bricks[:, ::2], bricks[:, 1::2], np.array(volume.cells)
+    good = (low >= 0) & (low < high) & (low % MACRO == 0) & ((high == cells) | (high < cells) & (high % MACRO == 0))
+    if not good.all():
+        brick = bricks[np.flatnonzero(~good.all(axis=1))[0]].tolist()
+        raise SceneError(
+            f"the brick {brick} does not fit a volume of {' x '.join(map(str, volume.cells))} cells: "
+            f"its faces must lie on multiples of {MACRO} cells or at the volume's end"
+        )
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

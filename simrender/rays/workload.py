@@ -98,10 +98,12 @@ class Workload:
         """The published size of the scene."""
         card, scene = self.card.published, self.scene
         own_bytes = sum(m.vertices.nbytes + m.faces.nbytes for m in scene.meshes)
+        unique = card.triangles or scene.unique_triangles
+        instanced = unique * scene.instanced_triangles / max(1, scene.unique_triangles)
         return Published(
-            triangles=card.growth * (card.triangles or scene.unique_triangles),
+            triangles=card.growth * unique,
             instances=card.growth * (card.instances or len(scene.instance_object)),
-            instanced_triangles=card.growth**2 * (card.instanced_triangles or scene.instanced_triangles),
+            instanced_triangles=card.growth**2 * (card.instanced_triangles or instanced),
             geometry_bytes=card.growth * (own_bytes if card.geometry_bytes is None else card.geometry_bytes),
             texture_bytes=card.growth * (card.texture_bytes or 0.0),
         )
@@ -112,8 +114,13 @@ class Workload:
         return self.card.traced.samples or self.card.published.samples
 
     @property
+    def repeats(self) -> int:
+        """Published samples a pixel for which a traced one stands."""
+        return self.card.published.samples // self.samples
+
+    @property
     def weight(self) -> float:
-        """Published rays of one sample a pixel for which a traced ray stands; see `samples` for the others."""
+        """Published rays of one sample a pixel for which a traced ray stands; see `repeats` for the others."""
         (width, height), (w, h) = self.card.published.resolution, self.card.traced.resolution
         return width * height / (w * h)
 
@@ -261,7 +268,8 @@ def _file_card(path: Path, content: SceneFile) -> Document:
         return _card(
             path, centre + np.array(SPRAY_VIEW) * 0.5 * (high - low), centre, np.array([0.0, 1.0, 0.0]), 90.0,
             "{resolution: 512x512, samples: 1}", "{resolution: 512x512}",
-            "domains: {method: given}\nintegrator: {name: spray_path_tracing, bounces: 1, shadow_samples: 1}\n", "corner",
+            "domains: {method: given}\nintegrator: {name: spray_path_tracing, bounces: 1, shadow_samples: 1}\n",
+            "corner",
         )  # fmt: skip
     towards = np.array([0.9, 0.55, 1.0]) if up[1] else np.array([0.9, -1.0, 0.55])
     towards /= np.linalg.norm(towards)

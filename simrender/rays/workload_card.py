@@ -93,8 +93,8 @@ class KeyCard(Card):
 class CameraCard(Card):
     """A pinhole camera, and its way through the frames of an animation.
 
-    ``sampling`` says where rays go through their pixels: ``jittered``, through random points, or ``corner``, all through
-    the lower left corner, as SpRay does with one sample a pixel.
+    ``sampling`` says where rays go through their pixels: ``jittered``, through random points, or ``corner``, all
+    through the lower left corner, as SpRay does with one sample a pixel.
     """
 
     position: Vector

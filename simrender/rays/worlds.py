@@ -71,8 +71,8 @@ class World(Protocol):
         Returns
         -------
         dict of arrays
-            For each ray ``t``, ``primitive``, ``radiance``, ``children`` and the columns of `outcome`; for the rays that
-            they spawn, in the order of their parents, the columns `SPAWNED`.
+            For each ray ``t``, ``primitive``, ``radiance``, ``children`` and the columns of `outcome`; for the rays
+            that they spawn, in the order of their parents, the columns `SPAWNED`.
 
         """
 
@@ -140,18 +140,24 @@ class SurfaceWorld:
 
     def follow(self, rays: Columns, seed: int, done: Report | None = None) -> Columns:
         """See `World`."""
-        geometry = self.geometry
+        geometry, n = self.geometry, len(rays["kind"])
+        own = {"t": np.empty(n, np.float32), "primitive": np.empty(n, np.int32)}
+        own |= {"radiance": np.empty((n, 3), np.float32), "children": np.empty(n, np.uint16)}
 
         def work(rows: slice) -> Columns:
             chunk = {name: column[rows] for name, column in rays.items()}
             hits = geometry.nearest(chunk["origin"], chunk["direction"], chunk["reach"])
             shaded = self.shade(chunk, hits, seed)
-            shaded["parent"] = shaded["parent"] + np.int32(rows.start)
-            return shaded | {"t": hits.t, "primitive": hits.primitive}
+            made = shaded | {"t": hits.t, "primitive": hits.primitive}
+            for name, column in own.items():
+                column[rows] = made[name]
+            made["parent"] = made["parent"] + np.int32(rows.start)
+            # Views of arrays with room for every child that there might have been would keep these alive.
+            return {name: made[name] if made[name].base is None else made[name].copy() for name in SPAWNED}
 
         parts = [work(slice(0, 0))]  # loads the kernels, or compiles them the first time
-        parts += embree.in_chunks(work, len(rays["kind"]), done)
-        return joined(parts)
+        parts += embree.in_chunks(work, n, done)
+        return own | joined(parts)
 
     def cross(self, rays: Columns, ray: Ids, domains: Domains, domain: NDArray[np.int16], seed: int) -> Columns:  # noqa: ARG002
         """See `World`."""
@@ -376,14 +382,13 @@ def by_domain(domain: NDArray[np.int16]) -> Iterator[tuple[int, Ids]]:
     order = np.argsort(domain, kind="stable")
     sorted_ = domain[order]
     starts = np.flatnonzero(np.diff(sorted_, prepend=-1))
-    for d, rows in zip(sorted_[starts].tolist(), np.split(order, starts[1:]), strict=True):
-        yield d, rows
+    yield from zip(sorted_[starts].tolist(), np.split(order, starts[1:]), strict=True)
 
 
 def joined(parts: list[Columns]) -> Columns:
-    """Join columns, each on a core of its own."""
+    """Join columns, each on a core of its own; the parts are emptied, so that little is held twice."""
     names = list(parts[0])
-    return dict(zip(names, embree.on_all_cores(lambda n: np.concatenate([p[n] for p in parts]), names), strict=True))
+    return dict(zip(names, embree.on_all_cores(lambda n: np.concatenate([p.pop(n) for p in parts]), names), strict=True))
 
 
 def in_blocks(block: Callable[[Columns], Columns], rays: Columns, done: Report | None) -> Columns:

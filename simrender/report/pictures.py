@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from simrender.rays.integrators import ElementMarching, VolumeMarching
+from simrender.report.tracing import unit_of_work
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -114,17 +115,23 @@ def _fragments(trace: Trace, domains: Domains, paint: F64, crossings: Crossings)
     return np.asarray(image[:, :3] + (1.0 - image[:, 3:]) * _NOTHING, np.float64)
 
 
-def work_of_pixels(trace: Trace) -> tuple[F64, str]:
-    """Return the work of each pixel, float64 (height, width), and what it is counted in."""
-    pixel = trace.column("pixel")
+def work_of_pixels(trace: Trace, crossings: Crossings) -> tuple[F64, str]:
+    """Return the work of each pixel, float64 (height, width), and what it is counted in.
+
+    Through volumes that is samples, look-ups or elements. On surfaces it is queries: for each ray, camera ray or
+    descendant, the domains that it enters before it hits something.
+    """
     if trace.world.outcome:
-        work = np.bincount(pixel, trace.column("work"), minlength=trace.pixels)
-        unit = "elements" if isinstance(trace.integrator, ElementMarching) else "samples of the volume"
-        if not isinstance(trace.integrator, ElementMarching | VolumeMarching):
-            unit = "look-ups of the volume"
-    else:
-        work, unit = np.bincount(pixel, minlength=trace.pixels).astype(np.float64), "rays"
-    return work.reshape(trace.size[1], trace.size[0]), unit
+        volume = np.bincount(trace.column("pixel"), trace.column("work"), minlength=trace.pixels).astype(np.float64)
+        return volume.reshape(trace.size[1], trace.size[0]), unit_of_work(trace)
+    work: F64 = np.zeros(trace.pixels)
+    for generation in range(trace.generations):
+        rays = slice(trace.first[generation], trace.first[generation + 1])
+        table, t, pixel = crossings.table(generation), trace.column("t")[rays], trace.column("pixel")[rays]
+        ray = np.repeat(np.arange(len(t)), np.diff(table["first"]))
+        before = table["entry"] <= t[ray]
+        work += np.bincount(pixel, np.bincount(ray[before], minlength=len(t)), minlength=trace.pixels)
+    return work.reshape(trace.size[1], trace.size[0]), "queries of a ray in a domain"
 
 
 def plot_heat(values: F64, title: str, label: str) -> Figure:
@@ -142,11 +149,12 @@ def plot_heat(values: F64, title: str, label: str) -> Figure:
     return figure
 
 
-def plot_work(name: str, trace: Trace) -> Figure:
+def plot_work(name: str, trace: Trace, crossings: Crossings) -> Figure:
     """Draw how much work each traced pixel is."""
-    work, unit = work_of_pixels(trace)
-    mean, most = work.mean(), work.max()
-    return plot_heat(work, f"{name}: work of each pixel, {mean:,.1f} {unit} on average, {most:,.0f} at most", unit)
+    work, unit = work_of_pixels(trace, crossings)
+    return plot_heat(
+        work, f"{name}: work of each pixel, {work.mean():,.1f} on average, {work.max():,.0f} at most", unit
+    )
 
 
 def plot_error(name: str, image: Estimate) -> Figure:
@@ -156,5 +164,3 @@ def plot_error(name: str, image: Estimate) -> Figure:
     share = float(np.sqrt((error**2).mean())) / mean if mean > 0.0 else 0.0
     title = f"{name}: standard error of each pixel, {image.replicas} replicas; root mean square {share:.1%} of the mean"
     return plot_heat(error, title, "standard error of the mean radiance")
-
-

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import RenderableType
+from rich.console import Group, RenderableType
 from rich.table import Table
 
 from simrender.rays import embree
@@ -47,7 +47,9 @@ def raw_embreex_seconds(trace: Trace, clock: Callable[[], float]) -> float:
 def describe_rays(name: str, trace: Trace) -> RenderableType:
     """Return a table of a completed trace: rays of each kind, and how many of them hit something."""
     rays, hits = ray_counts(trace)
-    table = _table(f"{name}: {trace.size[0]}x{trace.size[1]}, {trace.samples} paths a pixel", "rays", "traced", "hit", "share")
+    table = _table(
+        f"{name}: {trace.size[0]}x{trace.size[1]}, {trace.samples} paths a pixel", "rays", "traced", "hit", "share"
+    )
     for label in KINDS:
         if rays[label] or label != "scatter":
             word = " occluded" if label == "shadow" else ""
@@ -56,8 +58,7 @@ def describe_rays(name: str, trace: Trace) -> RenderableType:
     table.add_section()
     total = sum(hits.values())
     table.add_row("all", f"{trace.rays:,}", f"{total:,}", f"{total / trace.rays:.1%}")
-    table.caption = f"{trace.generations} generations; {_size(trace)}\n"
-    return table
+    return Group(table, f"{trace.generations} generation{'s' if trace.generations > 1 else ''}; {_size(trace)}\n")
 
 
 def _size(trace: Trace) -> str:
@@ -108,11 +109,20 @@ def describe_domains(trace: Trace, crossings: Crossings) -> RenderableType:
     domains = crossings.domains
     entered = np.bincount(crossings.table(0)["domain"], minlength=domains.count)
     hits = nearest_hits(trace, domains)
-    columns = ["bytes as published", "primitives", "camera rays", *(["nearest hits", "share"] if hits is not None else [])]
+    columns = [
+        "bytes as published",
+        "primitives",
+        "camera rays",
+        *(["nearest hits", "share"] if hits is not None else []),
+    ]
     table = _table("", "domain", *columns)
 
     def row(label: str, of: slice) -> None:
-        cells = [format_bytes(domains.bytes[of].sum()), format_count(domains.primitives[of].sum()), f"{entered[of].sum():,}"]
+        cells = [
+            format_bytes(domains.bytes[of].sum()),
+            format_count(domains.primitives[of].sum()),
+            f"{entered[of].sum():,}",
+        ]
         if hits is not None:
             cells += [f"{hits[of].sum():,}", f"{hits[of].sum() / max(1, hits.sum()):.1%}"]
         table.add_row(label, *cells)
@@ -124,7 +134,7 @@ def describe_domains(trace: Trace, crossings: Crossings) -> RenderableType:
         row(f"{shown} to {domains.count - 1}", slice(shown, None))
     table.add_section()
     row("all", slice(None))
-    return table
+    return Group(table, "")
 
 
 def describe_estimates(estimates: dict[str, Estimate]) -> RenderableType:
@@ -134,20 +144,21 @@ def describe_estimates(estimates: dict[str, Estimate]) -> RenderableType:
     for name, found in estimates.items():
         mean, half = float(found.mean), float(found.half_width)
         table.add_row(name, format_count(mean), f"± {format_count(half)}", f"± {half / mean:.2%}" if mean else "")
-    table.caption = f"from {some.replicas} independent replicas\n"
-    return table
+    return Group(table, f"from {some.replicas} independent replicas\n")
 
 
 def replica_counts(workload: Workload, trace: Trace, crossings: Crossings) -> dict[str, float]:
     """Return what a replica counts, scaled to the published frame: rays, hits, and rays that enter each domain."""
-    scale = workload.weight * workload.card.published.samples / workload.samples
+    scale = workload.weight * workload.repeats
     rays, hits = ray_counts(trace)
     counts = {f"{kind} rays": rays[kind] * scale for kind in KINDS if rays[kind] or kind == "camera"}
     counts |= {f"{kind} hits": hits[kind] * scale for kind in KINDS if rays[kind] or kind == "camera"}
     entered = np.zeros(crossings.domains.count)
     for generation in range(trace.generations):
         entered += np.bincount(crossings.table(generation)["domain"], minlength=len(entered))
-    counts |= {f"rays that enter domain {d}": float(entered[d]) * scale for d in range(min(len(entered), SHOWN_DOMAINS))}
+    counts |= {
+        f"rays that enter domain {d}": float(entered[d]) * scale for d in range(min(len(entered), SHOWN_DOMAINS))
+    }
     counts["mean radiance"] = float(trace.image().mean())
     return counts
 
@@ -174,7 +185,7 @@ def trace_dict(workload: Workload, trace: Trace, crossings: Crossings) -> dict[s
         "resolution": list(trace.size),
         "samples": trace.samples,
         "seed": trace.seed,
-        "ray_weight": workload.weight,
+        "ray_weight": workload.weight * workload.repeats,
         "generations": trace.generations,
         "rays": trace.rays,
         "camera_hits": hits["camera"],
@@ -215,7 +226,7 @@ def describe_speed(trace: Trace, seconds: float, clock: Callable[[], float]) -> 
 
 
 def _table(title: str, first: str, *numbers: str) -> Table:
-    table = Table(box=None, pad_edge=False, title=title, title_justify="left", caption_justify="left")
+    table = Table(box=None, pad_edge=False, title=title, title_justify="left")
     table.add_column(first)
     for heading in numbers:
         table.add_column(heading, justify="right")

@@ -91,3 +91,9 @@ def test_numerics_thousands_of_thin_fragments_keep_their_opacity():
     rgba = np.tile(np.array([[0, 0, 0, -np.expm1(-tau)]], np.float32), (n, 1))
     image = composite(rgba, np.arange(n, dtype=np.float64), np.zeros(n, int), np.zeros(n, int), 1)
     assert image[0, 3] == pytest.approx(-np.expm1(-n * tau), rel=1e-6)
+
+
+@pytest.mark.parametrize("ray", [-1, 2])
+def test_a_fragment_of_a_ray_that_does_not_exist_is_refused(ray):
+    with pytest.raises(IndexError, match=f"a fragment is of ray {ray}, but there are 2 rays"):
+        composite(np.zeros((2, 4), np.float32), np.zeros(2), np.array([0, ray]), np.zeros(2, int), 2)

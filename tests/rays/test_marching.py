@@ -205,3 +205,9 @@ def test_numerics_opacity_of_thin_and_thick_slabs():
 def test_a_step_that_is_no_length_is_refused(step):
     with pytest.raises(SceneError, match="the step of a ray march is a length above"):
         marched(ramp(), step, bundle([[0.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]]))
+
+
+def test_a_brick_that_ends_within_a_macro_cell_is_refused():
+    rays = bundle([[0.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]])
+    with pytest.raises(SceneError, match=r"the brick \[0, 9, 0, 16, 0, 16\] does not fit"):
+        marched(ramp(), 0.5, rays, np.array([[0, 9, 0, 16, 0, 16]], np.int32))

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from simrender.errors import SceneError
 from simrender.rays.tracking import ISOSURFACE, NOTHING, SCATTER, _field, isotropic_direction, track
 from simrender.rays.volume import MACRO, TransferFunction, Volume
 from tests.rays.test_volume import SPIKY, bundle, hard_rays, in_bricks, kd_bricks, noise, whole
@@ -200,6 +201,13 @@ def test_bricks_change_no_bit(isovalues):
         through = one.event == NOTHING
         assert (many.samples.reshape(n, count).sum(axis=1) == one.samples)[through].all()
         assert (many.cells.reshape(n, count).sum(axis=1) == one.cells)[through].all()
+
+
+def test_a_brick_that_ends_within_a_macro_cell_is_refused():
+    with pytest.raises(
+        SceneError, match=r"the brick \[0, 32, 0, 9, 0, 32\] does not fit a volume of 32 x 32 x 32 cells"
+    ):
+        tracked(ramp(CLEAR), along_x(3), np.array([[0, 32, 0, 9, 0, 32]], np.int32))
 
 
 def test_a_ray_followed_from_brick_to_brick_takes_the_samples_of_one_brick():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from simrender.errors import SceneError
-from simrender.rays.volume import MACRO, TransferFunction, Volume, find_row
+from simrender.rays.volume import MACRO, TransferFunction, Volume, check_bricks, find_row
 from workloads.terrain import generator
 
 GREY = TransferFunction([0.0, 1.0], [[0.0, 0.0, 0.0], [1.0, 1.0, 1.0]], [0.0, 0.5])
@@ -217,3 +217,16 @@ def test_a_transfer_function_that_makes_no_sense_says_why(changed, message):
     good = {"values": [0.0, 1.0], "colors": np.zeros((2, 3)), "opacities": [0.0, 0.5]}
     with pytest.raises(SceneError, match=message):
         TransferFunction(**(good | changed))
+
+
+@pytest.mark.parametrize(
+    "brick", [[0, 8, 0, 20, 0, 24], [0, 4, 0, 20, 0, 16], [-8, 8, 0, 20, 0, 16], [8, 8, 0, 20, 0, 16]]
+)
+def test_a_brick_that_is_not_made_of_whole_macro_cells_is_refused(brick):
+    volume = Volume(noise(31, 21, 17), (1, 1, 1), (0, 0, 0), GREY)
+    good = np.array([[0, 30, 0, 20, 0, 16], [8, 30, 16, 20, 8, 16]], np.int32)
+    check_bricks(volume, good)
+    with pytest.raises(
+        SceneError, match=r"^the brick \[.*\] does not fit a volume of 30 x 20 x 16 cells: its faces must"
+    ):
+        check_bricks(volume, np.vstack([good, np.array([brick], np.int32)]))
