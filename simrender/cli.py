@@ -134,6 +134,7 @@ def trace(
     /,
     *,
     resolution: str | None = None,
+    frame: str | None = None,
     domains: str | None = None,
     partition: Literal["given", "kd_bricks", "sah", "grid", "balanced", "objects"] | None = None,
     replicas: Whole | None = None,
@@ -153,6 +154,8 @@ def trace(
         Name or path of a card, or path of a file that holds a mesh, a SpRay scene or a volume.
     resolution
         Trace so many pixels, WIDTHxHEIGHT; by default the card's traced.resolution.
+    frame
+        Of an animation along the camera's path, such as 0/8 to 7/8.
     domains
         How many domains, or the shape of a grid, such as 12x10x6; by default as the card says, else 8.
     partition
@@ -199,6 +202,11 @@ def trace(
             overrides.append(f"published.resolution={width}x{height}")  # a bare file publishes nothing
     begin = time.perf_counter()
     loaded = load_workload(workload, overrides, cache)
+    if frame is not None:
+        match = re.fullmatch("([0-9]{1,9})/([1-9][0-9]{0,8})", frame)
+        if match is None:
+            raise UsageError(f"--frame {frame}: expected NUMBER/COUNT such as 0/8, the first of eight")
+        loaded = loaded.frame(int(match[1]), int(match[2]))
     cut = _domains_card(loaded.card.domains, partition, domains)
     rays = loaded.trace(seed)
     with _Progress() as progress:

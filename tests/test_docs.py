@@ -13,7 +13,7 @@ SMALL = ["--set", "workload.traced.resolution=64x27"]
 
 
 def files(text):
-    return {block[1]: block[0] for block in re.findall(r"```yaml\n(# (\S+)\n.*?)```", text, re.DOTALL)}
+    return {block[1]: block[0] for block in re.findall(r"```\w+\n(# (\S+)\n.*?)```", text, re.DOTALL)}
 
 
 def commands(text):
@@ -22,7 +22,7 @@ def commands(text):
 
 
 def test_there_are_pages():
-    assert [page.name for page in PAGES] == ["write-a-machine-card.md"]
+    assert [page.name for page in PAGES] == ["write-a-machine-card.md", "write-a-workload-card.md"]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -34,7 +34,7 @@ def test_a_page_is_true(page, tmp_path, monkeypatch, capsys):
     told = re.search(r"^    simrender: (.*\n(?:    .+\n)*)", text, re.MULTILINE)
     for command in commands(text):
         with pytest.raises(SystemExit) as status:
-            main([*command, *(SMALL if command[0] == "run" else [])])
+            main([*command, *(SMALL if command[0] in {"run", "trace"} else [])])
         printed, complaints = capsys.readouterr()
         if "wrong.yaml" in command:
             assert status.value.code == 2

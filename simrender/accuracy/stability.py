@@ -23,7 +23,6 @@ from simrender.rays.domains import Domains
 from simrender.rays.integrators import PathTracing
 from simrender.rays.sampling import offset_origin
 from simrender.rays.scene import IDENTITY, Mesh, Scene, SceneObject
-from simrender.rays.store import NoStore
 from simrender.rays.trace import Trace
 from simrender.rays.worlds import SurfaceWorld
 
@@ -68,55 +67,97 @@ def path_rays(trace: Trace) -> Rays:
 
 
 def aimed_rays(scene: Scene, domains: Domains, count: int, seed: int = 1) -> dict[str, Rays]:
-    """Return rays that go where rounding decides, ``count`` of each kind, by name.
+    """Return rays that go where rounding decides, at most ``count`` of each kind, by name.
 
-    ============== ===================================================================================================
-    vertices       from anywhere at vertices, of two domains where there are such
-    edges          from anywhere at the middles of edges
-    axis-parallel  along an axis, to the digit through a vertex
-    diagonal       along a diagonal of an axis-aligned plane or cube through a vertex
-    faces          within a face of a domain's box, along an axis or askew
-    ============== ===================================================================================================
+    ============= ====================================================================================================
+    vertices      from anywhere at vertices, as exactly as float32 directions allow
+    edges         the same, at the middles of edges
+    axis-parallel along an axis, and to the last digit through a vertex
+    diagonal      through a vertex along the diagonals of a cube and of its faces
+    faces         through a vertex, askew within an axis-aligned plane: the face between two domains that share the vertex
+    ============= ====================================================================================================
+
+    Vertices that domains share come first. The last three kinds start close to their vertex and end close behind it,
+    and the surface around it is whole and not seen edge on. So each of these rays goes *through* that surface: one that
+    hits nothing has found a hole.
     """
     if domains.domain_of_triangle is None:
         raise SceneError("these domains do not say which triangles lie in them")
     rng = generator(seed)
-    triangles = scene.triangles
     low, high = (corner.astype(np.float64) for corner in scene.bounds)
-    size = float(np.linalg.norm(high - low))
-    first = np.full(len(triangles.vertices), domains.count, np.int32)
-    last = np.full(len(triangles.vertices), -1, np.int32)
-    for corner in triangles.faces.T:
-        np.minimum.at(first, corner, domains.domain_of_triangle)
-        np.maximum.at(last, corner, domains.domain_of_triangle)
-    shared = np.flatnonzero(first < last)
-    if len(shared) == 0:
-        shared = triangles.faces.ravel()
-    vertex = triangles.vertices[shared[rng.integers(0, len(shared), count)]]
-    edge = triangles.faces[rng.integers(0, len(triangles.faces), count)]
-    middle = triangles.vertices[edge[:, :2]].astype(np.float64).mean(axis=1).astype(np.float32)
+    mesh = _Welded(scene, domains.domain_of_triangle)
     start = (low + (rng.random((count, 3)) * 3.0 - 1.0) * (high - low)).astype(np.float32)
-    axis = np.eye(3)[rng.integers(0, 3, count)] * rng.choice([-1.0, 1.0], (count, 1))
-    diagonal = rng.choice([-1.0, 1.0], (count, 3)) * np.array([[1, 1, 0], [1, 0, 1], [0, 1, 1], [1, 1, 1]])[
-        rng.integers(0, 4, count)
-    ]
-    filled = np.flatnonzero((domains.low <= domains.high).all(axis=1))
-    box = filled[rng.integers(0, len(filled), count)]
-    side = rng.integers(0, 3, count)
-    plane = np.where(rng.random(count) < 0.5, domains.low[box, side], domains.high[box, side])
-    target = low + rng.random((count, 3)) * (high - low)
-    within = np.where(rng.random((count, 1)) < 0.5, np.roll(np.eye(3), 1, axis=0)[side], target - start)
-    rows = np.arange(count)
-    on_plane = start.copy()
-    on_plane[rows, side] = plane
-    within[rows, side] = 0.0
+    edge = mesh.faces[rng.integers(0, len(mesh.faces), count), :2]
+    middle = mesh.vertices[edge].astype(np.float64).mean(axis=1).astype(np.float32)
+    flat = rng.standard_normal((count, 3))
+    flat[np.arange(count), rng.integers(0, 3, count)] = 0.0
+    shapes = np.array([[1, 1, 0], [1, 0, 1], [0, 1, 1], [1, 1, 1]])[rng.integers(0, 4, count)]
+    signs = rng.choice([-1.0, 1.0], (count, 3))
+    axes = np.eye(3)[rng.integers(0, 3, count)]
     return {
-        "vertices": bundle(start, vertex.astype(np.float64) - start),
+        "vertices": bundle(start, mesh.vertices[mesh.pick(mesh.used, count, rng)].astype(np.float64) - start),
         "edges": bundle(start, middle.astype(np.float64) - start),
-        "axis-parallel": bundle(np.where(axis == 0.0, vertex, vertex - 2.0 * size * axis), axis),
-        "diagonal": bundle(vertex - size * diagonal, diagonal),
-        "faces": bundle(on_plane, within),
+        "axis-parallel": mesh.through(axes * signs, rng),
+        "diagonal": mesh.through(shapes * signs, rng),
+        "faces": mesh.through(flat, rng),
     }
+
+
+class _Welded:
+    """A scene's triangles with one vertex a place, and which vertices lie inside a surface."""
+
+    def __init__(self, scene: Scene, domain: NDArray[np.int32]) -> None:
+        triangles = scene.triangles
+        self.vertices, same = np.unique(triangles.vertices, axis=0, return_inverse=True)
+        self.faces = same.reshape(-1)[triangles.faces]
+        count = len(self.vertices)
+        a, b, c = (self.vertices[self.faces[:, k]].astype(np.float64) for k in range(3))
+        self.normals: F64 = np.cross(b - a, c - a)
+        length = np.linalg.norm(self.normals, axis=1, keepdims=True)
+        self.normals /= np.where(length > 0.0, length, 1.0)
+        self.size = float(np.linalg.norm(np.subtract(*scene.bounds)))
+        # The faces around each vertex.
+        flat = self.faces.ravel()
+        self.around = np.argsort(flat, kind="stable") // 3
+        self.begin = np.searchsorted(np.sort(flat), np.arange(count + 1))
+        self.used = np.flatnonzero(np.diff(self.begin) > 0)
+        ends = np.sort(np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]]), axis=1)
+        keys, times = np.unique(ends[:, 0].astype(np.int64) * count + ends[:, 1], return_counts=True)
+        open_ = keys[times != 2]
+        closed = np.ones(count, np.bool_)
+        closed[np.concatenate([open_ // count, open_ % count])] = False
+        self.inner = np.flatnonzero(closed & (np.diff(self.begin) > 0))
+        self.shared = np.zeros(count, np.bool_)
+        first, last = np.full(count, np.iinfo(np.int32).max, np.int32), np.full(count, -1, np.int32)
+        for corner in self.faces.T:
+            np.minimum.at(first, corner, domain)
+            np.maximum.at(last, corner, domain)
+        self.shared = first < last
+
+    def pick(self, among: Ids, count: int, rng: np.random.Generator) -> Ids:
+        """Return vertices at random, those that domains share if there are such."""
+        shared = among[self.shared[among]]
+        pool = shared if len(shared) else among
+        return pool[rng.integers(0, len(pool), count)] if len(pool) else pool
+
+    def through(self, direction: F64, rng: np.random.Generator) -> Rays:
+        """Return the rays of some directions, each through a vertex at random, that pass through its surface there."""
+        vertex = self.pick(self.inner, len(direction), rng)
+        direction = direction[: len(vertex)]
+        faces = self.begin[vertex + 1] - self.begin[vertex]
+        starts = np.concatenate([[0], np.cumsum(faces)])
+        row = np.repeat(np.arange(len(vertex)), faces)
+        face = self.around[self.begin[vertex][row] + np.arange(len(row)) - starts[:-1][row]]
+        unit = direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        cosine = (self.normals[face] * unit[row]).sum(axis=1)
+        least, most = (f.reduceat(cosine, starts[:-1]) if len(row) else cosine for f in (np.minimum, np.maximum))
+        keep = (least > 0.1) | (most < -0.1)
+        vertex, direction = vertex[keep], direction[keep]
+        # A power of two times a direction of 0 and 1 is exact, and so are most sums with a vertex.
+        step = 2.0 ** np.floor(np.log2(0.01 * self.size)) * direction
+        return bundle(self.vertices[vertex] - step, direction) | {
+            "reach": (2.0 * np.linalg.norm(step, axis=1)).astype(np.float32)
+        }
 
 
 # -- partitions -------------------------------------------------------------------------------------------------------
@@ -137,7 +178,7 @@ class Compared:
     ties : int
         Rays that hit another triangle at the same distance.
     largest : float
-        The largest difference of distances, relative to the distance.
+        The largest difference of distances, relative to the distance or the scene's size, whichever is larger.
 
     """
 
@@ -176,8 +217,8 @@ def compare(world: SurfaceWorld, domains: Domains, rays: Rays) -> Compared:
     leaks = (one < 0) != (primitive < 0)
     hits = (one >= 0) & (primitive >= 0)
     error = np.zeros(len(one))
-    # Distances far below the scene's size have no digits to compare.
-    scale = np.maximum(one_t[hits], 1e-6 * np.linalg.norm(np.subtract(*world.scene.bounds)))
+    # Coordinates have the digits of the scene's size, and so have distances, however short.
+    scale = np.maximum(one_t[hits], np.linalg.norm(np.subtract(*world.scene.bounds)))
     error[hits] = np.abs(one_t[hits].astype(np.float64) - t[hits]) / scale
     ties = hits & (one_t == t) & (one != primitive)
     return Compared(

@@ -102,17 +102,25 @@ def march_parts(
     mesh = (elements.points, elements.scalars, elements.first, elements.corners, elements.shape, elements.across)
     shell = (hull.corners, hull.behind, hull.first, hull.boxes, hull.root)
 
-    columns = (rays["origin"], rays["direction"], rays["reach"])
+    # One layout and one type each, for the kernel is compiled for every combination it meets.
+    columns = tuple(np.ascontiguousarray(rays[name], np.float32) for name in ("origin", "direction", "reach"))
+    row_ray, row_part = np.ascontiguousarray(row_ray, np.int64), np.ascontiguousarray(row_part, np.int32)
 
     def work(rows: slice) -> tuple[Any, ...]:
         result: tuple[Any, ...] = _march(
             mesh, shell, elements.transfer.table, float(step), columns, row_ray[rows], row_part[rows]
         )
-        return (result[0] + rows.start, *result[1:])
+        result[0][:, 0] += rows.start
+        return result
 
     # The empty slice loads the kernel, or compiles it the first time.
     pieces = [work(slice(0, 0)), *embree.in_chunks(work, len(row_ray))]
-    return Fragments(*(np.concatenate([piece[column] for piece in pieces]) for column in range(7)))
+    made, walked, samples, segments = (np.concatenate([piece[i] for piece in pieces]) for i in range(4))
+    single = made[:, 1:].astype(np.float32)
+    return Fragments(
+        made[:, 0].astype(np.int64), single[:, 0].copy(), single[:, 1].copy(), single[:, 2:].copy(),
+        walked, samples, segments,
+    )  # fmt: skip
 
 
 # -- the boundary's hierarchy -----------------------------------------------------------------------------------------
@@ -313,11 +321,19 @@ def _reciprocal(x):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _entries(v, found, depth, shell, part, origin, direction, reach, frame):  # type: ignore[no-untyped-def]
+def _doubled(rows):  # type: ignore[no-untyped-def]
+    """Return an array with the same rows and room for as many more."""
+    larger = np.empty((2 * len(rows), rows.shape[1]))
+    larger[: len(rows)] = rows
+    return larger
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _entries(v, found, shell, part, origin, direction, reach, frame):  # type: ignore[no-untyped-def]
     """Find the boundary triangles of a part through which a ray's line enters it, front to back.
 
-    ``found`` and ``depth`` are where they go; they come back with the count, in larger arrays if need be. Triangles
-    behind the origin count: the ray may start inside the segment that begins there.
+    Their distances and rows go to ``found``, float64 (m, 2), which comes back with their number, larger if need be.
+    Triangles behind the origin count: the ray may start inside the segment that begins there.
     """
     corners, _, first, boxes, root = shell
     kx, ky, kz, sx, sy, inverse = frame
@@ -355,18 +371,18 @@ def _entries(v, found, depth, shell, part, origin, direction, reach, frame):  # 
                 if t >= reach:
                     continue
                 if count == len(found):
-                    found, depth = np.append(found, found), np.append(depth, depth)
+                    found = _doubled(found)
                 i = count
-                while i > 0 and (depth[i - 1] > t or (depth[i - 1] == t and found[i - 1] > face)):
-                    found[i], depth[i] = found[i - 1], depth[i - 1]
+                while i > 0 and (found[i - 1, 0] > t or (found[i - 1, 0] == t and found[i - 1, 1] > face)):
+                    found[i, 0], found[i, 1] = found[i - 1, 0], found[i - 1, 1]
                     i -= 1
-                found[i], depth[i] = face, t
+                found[i, 0], found[i, 1] = t, face
                 count += 1
         # On to the next node in preorder: up while this is a right child, then to its sibling.
         while node & 1:
             node >>= 1
         node += 1 if node > 0 else 0
-    return count, found, depth
+    return count, found
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -432,26 +448,31 @@ def _cross(v, corner_count, shape, side, knots):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _march(mesh, shell, table, step, rays, row_ray, row_part):  # type: ignore[no-untyped-def]
-    """March rows; return the columns of `Fragments`, the fragments' rows counted from the first of these."""
+    """March rows.
+
+    Returns
+    -------
+    made : float64 array (f, 7)
+        The fragments: row, entry, exit, red, green, blue, opacity.
+    walked, samples, segments : int32 arrays (n,)
+
+    """
     points, scalars, first, corners, shape, across = mesh
     behind = shell[1]
     origins, directions, reaches = rays
     n = len(row_ray)
     walked, samples, segments = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32)
-    made = 0
-    row, entry, leave = np.empty(n, np.int64), np.empty(n, np.float32), np.empty(n, np.float32)
-    rgba = np.empty((n, 4), np.float32)
-    v, knots = np.empty((9, 4)), np.empty((SIDES + 2, 2))
-    found, depth = np.empty(16, np.int64), np.empty(16)
+    made, count = np.empty((max(n, 1), 7)), 0
+    v, knots, found = np.empty((9, 4)), np.empty((SIDES + 2, 2)), np.empty((16, 2))
     control = 0
     for i in range(n):
         origin, direction, reach = origins[row_ray[i]], directions[row_ray[i]], np.float64(reaches[row_ray[i]])
         frame = _frame(direction)
         kx, ky, kz, sx, sy, inverse = frame
-        count, found, depth = _entries(v, found, depth, shell, row_part[i], origin, direction, reach, frame)
-        for s in range(count):
-            e, side = behind[found[s]] >> 4, behind[found[s]] & 15
-            start = max(depth[s], 0.0)
+        entries, found = _entries(v, found, shell, row_part[i], origin, direction, reach, frame)
+        for s in range(entries):
+            start, face = max(found[s, 0], 0.0), int(found[s, 1])
+            e, side = behind[face] >> 4, behind[face] & 15
             end, fresh = start, True
             clear, red, green, blue = 1.0, 0.0, 0.0, 0.0
             while True:
@@ -506,10 +527,8 @@ def _march(mesh, shell, table, step, rays, row_ray, row_part):  # type: ignore[n
             if end > start:
                 segments[i] += 1
             if clear < 1.0:
-                if made == len(row):
-                    row, entry, leave = np.append(row, row), np.append(entry, entry), np.append(leave, leave)
-                    rgba = np.concatenate((rgba, rgba))
-                row[made], entry[made], leave[made] = i, start, end
-                rgba[made, 0], rgba[made, 1], rgba[made, 2], rgba[made, 3] = red, green, blue, 1.0 - clear
-                made += 1
-    return row[:made], entry[:made], leave[:made], rgba[:made], walked, samples, segments
+                if count == len(made):
+                    made = _doubled(made)
+                made[count] = i, start, end, red, green, blue, 1.0 - clear
+                count += 1
+    return made[:count], walked, samples, segments

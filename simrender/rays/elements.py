@@ -111,10 +111,9 @@ class Elements:
         if corners.min() < 0 or corners.max() >= len(points):
             outside = np.flatnonzero((corners < 0) | (corners >= len(points)))
             element = int(np.searchsorted(first, outside[0], side="right")) - 1
-            raise SceneError(
-                f"{len(outside)} corners of elements point outside the {len(points)} points; the first is "
-                f"{corners[outside[0]]} of element {element}, a {NAMES[int(kind[element])]}"
-            )
+            count = "1 corner of an element is" if len(outside) == 1 else f"{len(outside)} corners of elements are"
+            where = f"{corners[outside[0]]} of element {element}, a {NAMES[int(kind[element])]}"
+            raise SceneError(f"{count} outside the {len(points)} points; the first is {where}")
         if part.min() < 0:
             raise SceneError(f"parts are numbered from 0 on, got part {part.min()} of element {part.argmin()}")
         first, part = np.ascontiguousarray(first, dtype=np.int64), np.ascontiguousarray(part, dtype=np.int32)

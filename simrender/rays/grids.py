@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import gzip
 import math
-import os
 import re
 import warnings
 import zlib
@@ -30,9 +29,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from simrender.documents import Document
 from simrender.errors import SceneError, SceneWarning, did_you_mean
+from simrender.rays.memory import check_memory
 from simrender.rays.scene import F32
 from simrender.rays.volume import TransferFunction, Triple, Volume
-from simrender.units import format_bytes
 
 F64 = NDArray[np.float64]
 
@@ -191,47 +190,6 @@ def default_transfer(voxels: F32, spacing: Triple = (1.0, 1.0, 1.0)) -> Transfer
         )
     values = np.array([low, 0.5 * low + 0.5 * high, high])
     return TransferFunction(values, np.array([cool, white, warm]), np.array([0.0, 0.35, 0.9]), unit)
-
-
-def check_memory(need_bytes: float, what: str) -> None:
-    """Refuse to make something that does not fit into the memory that is available now.
-
-    Parameters
-    ----------
-    need_bytes : float
-    what : str
-        Begins the message: ``"a volume of 4096x4096x4096 voxels"``.
-
-    Raises
-    ------
-    SceneError
-        If there is less memory than that.
-
-    """
-    have = _available_bytes()
-    if need_bytes > have:
-        raise SceneError(
-            f"{what} needs {format_bytes(need_bytes)} of memory, and {format_bytes(have)} are available here"
-        )
-
-
-def _available_bytes() -> float:
-    """Return the memory that can be had without swapping, as far as this system tells."""
-    have = float("inf")
-    if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}):
-        have = float(os.sysconf("SC_PHYS_PAGES")) * os.sysconf("SC_PAGE_SIZE")
-    # Pages that only cache files count as available: the kernel's own estimate knows of them, sysconf does not.
-    for file, pattern, unit in (
-        ("/proc/meminfo", r"MemAvailable:\s+(\d+) kB", 1024.0),
-        ("/sys/fs/cgroup/memory.max", r"(\d+)", 1.0),
-    ):
-        try:
-            found = re.search(pattern, Path(file).read_text(encoding="ascii"))
-        except OSError:
-            continue
-        if found:
-            have = min(have, float(found[1]) * unit)
-    return have
 
 
 def _check_volume_memory(dims: Any, dtype: np.dtype[Any]) -> None:

@@ -42,6 +42,7 @@ from numpy.typing import NDArray
 from simrender.rays import embree
 from simrender.rays.integrators import Integrator
 from simrender.rays.kinds import CAMERA, KINDS
+from simrender.rays.memory import check_memory
 from simrender.rays.scene import Scene
 from simrender.rays.store import NoStore, Store, code_version
 
@@ -54,6 +55,9 @@ Columns = dict[str, Any]
 GEOMETRY = ("origin", "direction", "reach", "throughput", "pixel", "sample", "kind", "diffuse", "mirror", "parent")
 OUTCOME = ("t", "primitive", "radiance", "children", "kind", "pixel")
 """What a replay needs, stored apart from the geometry so that it reads no more than this."""
+
+_TRIANGLE_BYTES, _RAY_BYTES = 130.0, 140.0
+"""What tracing takes for each triangle (world space, Embree's hierarchy) and for each ray (the table, and one copy)."""
 
 _HANDY = (1.0, 1e6)
 """Sizes of a scene that are traced as they are."""
@@ -85,6 +89,8 @@ class Trace:
         Told how far tracing has come.
     jitter : bool
         Whether camera rays go through random points of their pixels, or all through the same corner.
+    like : Trace, optional
+        A trace of the same scene with the same integrator, whose hierarchies this one uses too.
 
     Attributes
     ----------
@@ -107,9 +113,12 @@ class Trace:
         progress: Progress | None = None,
         *,
         jitter: bool = True,
+        like: Trace | None = None,
     ) -> None:
-        self.factor = factor = _handy(scene)
-        self.scene = scene if factor == 1.0 else scene.scaled(factor)
+        self._like = like
+        factor: float = _handy(scene) if like is None else like.factor
+        traced: Scene = (scene if factor == 1.0 else scene.scaled(factor)) if like is None else like.scene
+        self.factor, self.scene = factor, traced
         self.camera = camera * np.array([[factor], [1.0], [1.0], [1.0]])
         self.size, self.samples = size, samples
         self.integrator, self.seed, self.progress, self.jitter = integrator, seed, progress, jitter
@@ -230,7 +239,7 @@ class Trace:
         """The scene, ready for the integrator."""
         from simrender.rays.worlds import world
 
-        return world(self.scene, self.integrator)
+        return world(self.scene, self.integrator) if self._like is None else self._like.world
 
     def _know(self, ray: int) -> None:
         while self.first[-1] <= ray:
@@ -260,6 +269,8 @@ class Trace:
         return self.store.load(f"{generation:03d}-hits", self._outcome, expected)
 
     def _trace(self, generation: int) -> Columns:
+        if generation == 0:
+            self._check_memory()
         rays = self._first_rays() if generation == 0 else self._spawned_rays(generation)
         count = len(rays["kind"])
         report = partial(self._report, generation, count)
@@ -273,6 +284,15 @@ class Trace:
         files = ((f"{generation + 1:03d}-rays", spawned), (f"{generation:03d}-hits", outcome))
         embree.on_all_cores(lambda file: self.store.save(*file), files)
         return outcome
+
+    def _check_memory(self) -> None:
+        """Refuse what cannot fit, before it is begun: hierarchies, and camera rays with one child each."""
+        triangles, rays = self.scene.instanced_triangles, self.pixels * self.samples
+        check_memory(
+            triangles * _TRIANGLE_BYTES + 2.0 * rays * _RAY_BYTES,
+            f"tracing {self.size[0]}x{self.size[1]} pixels, {self.samples} samples each, among {triangles:,} triangles",
+            "; a smaller workload.traced.resolution or fewer workload.traced.samples need less",
+        )
 
     def _report(self, generation: int, count: int, done: int) -> None:
         if self.progress:

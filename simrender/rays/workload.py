@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -59,6 +59,7 @@ class Workload:
     _crossings: dict[tuple[int, str], Crossings] = field(default_factory=dict)
     _partitions: dict[Any, Partition] = field(default_factory=dict)
     _domains: dict[str, Domains] = field(default_factory=dict)
+    _like: Trace | None = None
 
     @property
     def scene(self) -> Scene:
@@ -124,6 +125,30 @@ class Workload:
         (width, height), (w, h) = self.card.published.resolution, self.card.traced.resolution
         return width * height / (w * h)
 
+    def frame(self, number: int, of: int) -> Workload:
+        """Return the workload of one frame of an animation: the camera at that point of its way.
+
+        Parameters
+        ----------
+        number : int
+            From 0 to ``of`` - 1; the first frame is at the beginning of the camera's path, the last at its end.
+        of : int
+
+        Raises
+        ------
+        UsageError
+            If there is no such frame.
+
+        """
+        if not 0 <= number < of:
+            raise UsageError(f"frame {number} of {of}: expected 0 to {of - 1}")
+        camera = self.card.camera.at(number / (of - 1) if of > 1 else 0.0)
+        card = self.card.model_copy(update={"camera": camera.model_copy(update={"path": ()})})
+        boxes = None if self.content.low is None or self.content.high is None else (self.content.low, self.content.high)
+        return replace(
+            self, card=card, given=self.scene, boxes=boxes, _traces={}, _crossings={}, _like=self._like or self.trace()
+        )
+
     @property
     def integrator(self) -> Integrator:
         """How light is followed."""
@@ -139,7 +164,7 @@ class Workload:
             camera, jitter = self.card.camera, self.card.camera.sampling == "jittered"
             self._traces[seed] = Trace(
                 self.scene, camera.at(0.0).frame(width / height), size, self.samples, self.integrator, seed, self.cache,
-                jitter=jitter,
+                jitter=jitter, like=self._like or next(iter(self._traces.values()), None),
             )  # fmt: skip
         self._traces[seed].progress = progress
         return self._traces[seed]

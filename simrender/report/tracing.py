@@ -47,9 +47,8 @@ def raw_embreex_seconds(trace: Trace, clock: Callable[[], float]) -> float:
 def describe_rays(name: str, trace: Trace) -> RenderableType:
     """Return a table of a completed trace: rays of each kind, and how many of them hit something."""
     rays, hits = ray_counts(trace)
-    table = _table(
-        f"{name}: {trace.size[0]}x{trace.size[1]}, {trace.samples} paths a pixel", "rays", "traced", "hit", "share"
-    )
+    title = f"{name}: {trace.size[0]}x{trace.size[1]}, {_several(trace.samples, 'path')} a pixel"
+    table = _table("rays", "traced", "hit", "share")
     for label in KINDS:
         if rays[label] or label != "scatter":
             word = " occluded" if label == "shadow" else ""
@@ -58,7 +57,11 @@ def describe_rays(name: str, trace: Trace) -> RenderableType:
     table.add_section()
     total = sum(hits.values())
     table.add_row("all", f"{trace.rays:,}", f"{total:,}", f"{total / trace.rays:.1%}")
-    return Group(table, f"{trace.generations} generation{'s' if trace.generations > 1 else ''}; {_size(trace)}\n")
+    return Group(title, table, f"{_several(trace.generations, 'generation')}; {_size(trace)}\n")
+
+
+def _several(count: int, noun: str) -> str:
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def _size(trace: Trace) -> str:
@@ -66,8 +69,8 @@ def _size(trace: Trace) -> str:
     parts = []
     if len(scene.instance_object):
         parts.append(
-            f"{len(scene.objects)} objects, {len(scene.instance_object):,} instances, {scene.unique_triangles:,} "
-            f"triangles, {scene.instanced_triangles:,} with instances"
+            f"{_several(len(scene.objects), 'object')}, {_several(len(scene.instance_object), 'instance')}, "
+            f"{_several(scene.unique_triangles, 'triangle')}, {scene.instanced_triangles:,} with instances"
         )
     if scene.volume is not None:
         parts.append(f"{' x '.join(str(n) for n in scene.volume.dims)} voxels")
@@ -115,7 +118,7 @@ def describe_domains(trace: Trace, crossings: Crossings) -> RenderableType:
         "camera rays",
         *(["nearest hits", "share"] if hits is not None else []),
     ]
-    table = _table("", "domain", *columns)
+    table = _table("domain", *columns)
 
     def row(label: str, of: slice) -> None:
         cells = [
@@ -140,7 +143,7 @@ def describe_domains(trace: Trace, crossings: Crossings) -> RenderableType:
 def describe_estimates(estimates: dict[str, Estimate]) -> RenderableType:
     """Return a table of what replicas say of the sampling error."""
     some = next(iter(estimates.values()))
-    table = _table("", "as published", "mean", f"{some.confidence:.0%} interval", "relative")
+    table = _table("as published", "mean", f"{some.confidence:.0%} interval", "relative")
     for name, found in estimates.items():
         mean, half = float(found.mean), float(found.half_width)
         table.add_row(name, format_count(mean), f"± {format_count(half)}", f"± {half / mean:.2%}" if mean else "")
@@ -225,8 +228,8 @@ def describe_speed(trace: Trace, seconds: float, clock: Callable[[], float]) -> 
     return f"{tables:.2f} Mray/s through the tables and onto the disk; {alone:.2f} Mray/s by embreex alone"
 
 
-def _table(title: str, first: str, *numbers: str) -> Table:
-    table = Table(box=None, pad_edge=False, title=title, title_justify="left")
+def _table(first: str, *numbers: str) -> Table:
+    table = Table(box=None, pad_edge=False)
     table.add_column(first)
     for heading in numbers:
         table.add_column(heading, justify="right")

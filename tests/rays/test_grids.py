@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from simrender.errors import CardError, SceneError, SceneWarning
-from simrender.rays import grids
-from simrender.rays.grids import check_memory, default_transfer, read_volume
+from simrender.rays import memory
+from simrender.rays.grids import default_transfer, read_volume
+from simrender.rays.memory import check_memory
 
 NX, NY, NZ = 4, 3, 2
 INDEX = np.arange(NX * NY * NZ).reshape(NZ, NY, NX)
@@ -279,8 +280,8 @@ def test_a_volume_too_large_for_the_memory_is_refused_before_it_is_read(tmp_path
 
 
 def test_check_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert 1e8 < grids._available_bytes() < 1e15
-    monkeypatch.setattr(grids, "_available_bytes", lambda: 16e9)
+    assert 1e8 < memory.available_bytes() < 1e15
+    monkeypatch.setattr(memory, "available_bytes", lambda: 16e9)
     check_memory(16e9, "this")
     with pytest.raises(
         SceneError, match=r"^a mesh of 5 triangles needs 17 GB of memory, and 16 GB are available here$"
