@@ -19,7 +19,7 @@ from simrender.hardware.machine import Machine, MachineCard, check_processors, l
 from simrender.policies.frame import Frame, Policy
 from simrender.policies.islands import Fit, Layout, fit
 from simrender.policies.rank import PIXEL_BYTES, Rank
-from simrender.rays.integrators import PathTracing
+from simrender.rays.integrators import PathTracing, RayCasting
 from simrender.rays.partition import Footprint, Partition
 from simrender.rays.trace import Progress, Trace
 from simrender.rays.workload import Workload, check_seed, load_workload
@@ -88,7 +88,7 @@ def simulate(
     if isinstance(workload, str):
         workload = load_workload(workload, given.get("workload", ()), cache)
     name, scheduler = _policy(policy, workload, given.get("policy", ()))
-    if not isinstance(workload.integrator, PathTracing):
+    if not isinstance(workload.integrator, PathTracing | RayCasting):
         other = workload.card.integrator.name
         hint = "; --set workload.integrator.name=path_tracing" if len(workload.scene.instance_object) else ""
         raise UsageError(

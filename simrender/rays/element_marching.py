@@ -101,17 +101,16 @@ def march_parts(
     hull = _hull(elements)
     mesh = (elements.points, elements.scalars, elements.first, elements.corners, elements.shape, elements.across)
     shell = (hull.corners, hull.behind, hull.first, hull.boxes, hull.root)
-
     # One layout and one type each, for the kernel is compiled for every combination it meets.
     columns = tuple(np.ascontiguousarray(rays[name], np.float32) for name in ("origin", "direction", "reach"))
     row_ray, row_part = np.ascontiguousarray(row_ray, np.int64), np.ascontiguousarray(row_part, np.int32)
 
     def work(rows: slice) -> tuple[Any, ...]:
-        result: tuple[Any, ...] = _march(
+        made, *counts = _march(
             mesh, shell, elements.transfer.table, float(step), columns, row_ray[rows], row_part[rows]
         )
-        result[0][:, 0] += rows.start
-        return result
+        made[:, 0] += rows.start
+        return made.copy(), *counts  # a copy lets go of the room that was not needed
 
     # The empty slice loads the kernel, or compiles it the first time.
     pieces = [work(slice(0, 0)), *embree.in_chunks(work, len(row_ray))]
@@ -270,7 +269,10 @@ def _turn(ax, ay, bx, by):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _meet(v, i, j, k):  # type: ignore[no-untyped-def]
-    """Return distance and scalar where the ray passes triangle (i, j, k) of the projected corners v (9, 4)."""
+    """Return distance and scalar where the ray passes triangle (i, j, k) of the projected corners v (9, 4).
+
+    The weights have one sign, or are 0, because the ray passes the triangle: both results lie between the corners'.
+    """
     wi = v[j, 0] * v[k, 1] - v[j, 1] * v[k, 0]
     wj = v[k, 0] * v[i, 1] - v[k, 1] * v[i, 0]
     wk = v[i, 0] * v[j, 1] - v[i, 1] * v[j, 0]
@@ -324,7 +326,9 @@ def _reciprocal(x):  # type: ignore[no-untyped-def]
 def _doubled(rows):  # type: ignore[no-untyped-def]
     """Return an array with the same rows and room for as many more."""
     larger = np.empty((2 * len(rows), rows.shape[1]))
-    larger[: len(rows)] = rows
+    for i in range(len(rows)):  # a slice would take seconds to compile
+        for j in range(rows.shape[1]):
+            larger[i, j] = rows[i, j]
     return larger
 
 
@@ -469,13 +473,15 @@ def _march(mesh, shell, table, step, rays, row_ray, row_part):  # type: ignore[n
         origin, direction, reach = origins[row_ray[i]], directions[row_ray[i]], np.float64(reaches[row_ray[i]])
         frame = _frame(direction)
         kx, ky, kz, sx, sy, inverse = frame
+        if not math.isfinite(sx + sy + inverse + origin[0] + origin[1] + origin[2]):
+            continue  # what has no direction meets nothing, and must not wander about
         entries, found = _entries(v, found, shell, row_part[i], origin, direction, reach, frame)
         for s in range(entries):
             start, face = max(found[s, 0], 0.0), int(found[s, 1])
             e, side = behind[face] >> 4, behind[face] & 15
             end, fresh = start, True
             clear, red, green, blue = 1.0, 0.0, 0.0, 0.0
-            while True:
+            while True:  # the chain ends, as it has no loops
                 k = first[e + 1] - first[e]
                 for j in range(k):
                     _project(v, j, points, corners[first[e] + j], origin, kx, ky, kz, sx, sy, inverse)
@@ -529,6 +535,7 @@ def _march(mesh, shell, table, step, rays, row_ray, row_part):  # type: ignore[n
             if clear < 1.0:
                 if count == len(made):
                     made = _doubled(made)
-                made[count] = i, start, end, red, green, blue, 1.0 - clear
+                made[count, 0], made[count, 1], made[count, 2] = i, start, end
+                made[count, 3], made[count, 4], made[count, 5], made[count, 6] = red, green, blue, 1.0 - clear
                 count += 1
     return made[:count], walked, samples, segments

@@ -11,6 +11,11 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
+class RayCasting:
+    """Camera rays alone, lit from the viewer: what is seen, and nothing spawned."""
+
+
+@dataclass(frozen=True)
 class PathTracing:
     """Path tracing of surfaces as ray queue cycling does it; see `shading`.
 
@@ -124,8 +129,17 @@ class ElementMarching:
     step: float = math.inf
 
 
-Integrator = PathTracing | AmbientOcclusion | SprayPathTracing | VolumeMarching | VolumePathTracing | ElementMarching
+Integrator = (
+    RayCasting
+    | PathTracing
+    | AmbientOcclusion
+    | SprayPathTracing
+    | VolumeMarching
+    | VolumePathTracing
+    | ElementMarching
+)
 INTEGRATORS: dict[str, type[Integrator]] = {
+    "ray_casting": RayCasting,
     "path_tracing": PathTracing,
     "ambient_occlusion": AmbientOcclusion,
     "spray_path_tracing": SprayPathTracing,

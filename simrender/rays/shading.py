@@ -8,7 +8,7 @@ limit or by Russian roulette on its throughput. A ray has at most two children, 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numba import njit
@@ -19,9 +19,17 @@ from simrender.rays.kinds import DIFFUSE, MIRROR, SHADOW
 from simrender.rays.sampling import cosine_direction, offset_origin, path_key, uniform
 from simrender.rays.scene import Environment, Scene
 
+if TYPE_CHECKING:
+    from simrender.rays.embree import Hits
+
+F32 = NDArray[np.float32]
+
 # Dimensions of the random numbers at a surface; lights use two (which, by reservoir) plus three (where) each.
 _LOBE, _ROULETTE, _DIRECTION, _LIGHTS = 0, 1, 2, 4
 _JITTER = 0
+
+_FACING = 0.7
+"""Share of a surface's brightness under a headlight that depends on the angle at which it is seen."""
 
 
 class Surfaces:
@@ -207,6 +215,43 @@ def surface_point(primitive, u, v, dx, dy, dz, vertices, faces, normals, colors,
         ag = w * colors[a, 1] + u * colors[b, 1] + v * colors[c, 1]
         ab = w * colors[a, 2] + u * colors[b, 2] + v * colors[c, 2]
     return px, py, pz, gx, gy, gz, nx, ny, nz, ar, ag, ab
+
+
+def headlight(directions: F32, sky: Environment, hits: Hits | None, surfaces: Surfaces | None) -> F32:
+    """Return what rays see, float32 (n, 3): triangles lit from the viewer, else the sky."""
+    seen = np.zeros((len(directions), 3), np.float32)
+    if hits is None or surfaces is None:
+        none, no_ids = np.zeros((0, 3), np.float32), np.full(len(directions), -1, np.int32)
+        flat = np.zeros(len(directions), np.float32)
+        _headlight(
+            directions, sky_row(sky), no_ids, flat, flat, none, np.zeros((0, 3), np.int32), none, none,
+            np.zeros(0, np.int32), np.zeros((0, 7)), seen,
+        )  # fmt: skip
+    else:
+        _headlight(
+            directions, sky_row(sky), hits.primitive, hits.u, hits.v, surfaces.vertices, surfaces.faces,
+            surfaces.normals, surfaces.colors, surfaces.material, surfaces.materials, seen,
+        )  # fmt: skip
+    return seen
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _headlight(  # type: ignore[no-untyped-def]
+    direction, sky, primitive, u, v, vertices, faces, normals, colors, material_of, materials, seen
+):
+    for i in range(len(direction)):
+        dx, dy, dz = np.float64(direction[i, 0]), np.float64(direction[i, 1]), np.float64(direction[i, 2])
+        if primitive[i] < 0:
+            for c in range(3):
+                seen[i, c] = sky_color(sky, dx, dy, dz, c)
+            continue
+        point = surface_point(
+            primitive[i], np.float64(u[i]), np.float64(v[i]), dx, dy, dz,
+            vertices, faces, normals, colors, material_of, materials,
+        )  # fmt: skip
+        facing = abs(dx * point[6] + dy * point[7] + dz * point[8])
+        for c in range(3):
+            seen[i, c] = point[9 + c] * (1.0 - _FACING + _FACING * facing)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

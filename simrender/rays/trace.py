@@ -101,6 +101,9 @@ class Trace:
 
     """
 
+    factor: float
+    scene: Scene
+
     def __init__(
         self,
         scene: Scene,
@@ -160,8 +163,10 @@ class Trace:
         if name not in self._joined:
             parts = [g[name] for g in self._outcomes]
             self._joined[name] = whole = parts[0] if len(parts) == 1 else np.concatenate(parts)
-            for g, begin, end in zip(self._outcomes, self.first, self.first[1:], strict=False):
-                g[name] = whole[begin:end]  # so that nothing is held twice
+            for g, outcome in enumerate(self._outcomes):  # views of it, so that nothing is held twice
+                outcome[name] = whole[self.first[g] : self.first[g + 1]]
+                if name in self._geometry.get(g, {}):
+                    self._geometry[g][name] = outcome[name]
         return self._joined[name]
 
     @property

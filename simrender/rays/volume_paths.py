@@ -19,7 +19,7 @@ from simrender.rays.integrators import VolumePathTracing
 from simrender.rays.kinds import SCATTER, SHADOW
 from simrender.rays.marching import gradients
 from simrender.rays.sampling import cosine_direction, offset_origin, path_key, uniform
-from simrender.rays.scene import Environment, Scene
+from simrender.rays.scene import Scene
 from simrender.rays.shading import sky_color, sky_row, surface_point
 from simrender.rays.tracking import isotropic_direction
 
@@ -35,9 +35,6 @@ F32 = NDArray[np.float32]
 _ROULETTE, _TURN, _LIGHT, _DIRECTION = 0, 1, 2, 3
 
 _NONE, _COLLISION, _ISOSURFACE, _TRIANGLE = 0, 1, 2, 3
-
-_HEADLIGHT = 0.7
-"""Share of a backdrop's brightness that depends on the angle at which it is seen."""
 
 _OFF_ISOSURFACE = 1e-3
 """Voxels by which a path starts off an isosurface, whose place is known to fewer digits than a triangle's."""
@@ -55,43 +52,6 @@ def _tracking_keys(seed, pixel, sample, kind, depth, keys):  # type: ignore[no-u
     for i in range(len(kind)):
         # Depths 0, 1, 2 ... are those of the shading kernels; a shadow ray has its parent's depth.
         keys[i] = path_key(seed, pixel[i], sample[i], (1 << 20) + 2 * np.int64(depth[i]) + (kind[i] == SHADOW))
-
-
-def backdrop(directions: F32, sky: Environment, hits: Hits | None, surfaces: Surfaces | None) -> F32:
-    """Return what rays see behind a volume, float32 (n, 3): triangles lit from the viewer, else the sky."""
-    seen = np.zeros((len(directions), 3), np.float32)
-    if hits is None or surfaces is None:
-        none, no_ids = np.zeros((0, 3), np.float32), np.full(len(directions), -1, np.int32)
-        flat = np.zeros(len(directions), np.float32)
-        _backdrop(
-            directions, sky_row(sky), no_ids, flat, flat, none, np.zeros((0, 3), np.int32), none, none,
-            np.zeros(0, np.int32), np.zeros((0, 7)), seen,
-        )  # fmt: skip
-    else:
-        _backdrop(
-            directions, sky_row(sky), hits.primitive, hits.u, hits.v, surfaces.vertices, surfaces.faces,
-            surfaces.normals, surfaces.colors, surfaces.material, surfaces.materials, seen,
-        )  # fmt: skip
-    return seen
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _backdrop(  # type: ignore[no-untyped-def]
-    direction, sky, primitive, u, v, vertices, faces, normals, colors, material_of, materials, seen
-):
-    for i in range(len(direction)):
-        dx, dy, dz = np.float64(direction[i, 0]), np.float64(direction[i, 1]), np.float64(direction[i, 2])
-        if primitive[i] < 0:
-            for c in range(3):
-                seen[i, c] = sky_color(sky, dx, dy, dz, c)
-            continue
-        point = surface_point(
-            primitive[i], np.float64(u[i]), np.float64(v[i]), dx, dy, dz,
-            vertices, faces, normals, colors, material_of, materials,
-        )  # fmt: skip
-        facing = abs(dx * point[6] + dy * point[7] + dz * point[8])
-        for c in range(3):
-            seen[i, c] = point[9 + c] * (1.0 - _HEADLIGHT + _HEADLIGHT * facing)
 
 
 def scatter(

@@ -174,6 +174,7 @@ class IntegratorCard(Card):
     """
 
     name: Literal[
+        "ray_casting",
         "path_tracing",
         "ambient_occlusion",
         "spray_path_tracing",
@@ -199,7 +200,9 @@ class IntegratorCard(Card):
         for name in sorted(self.model_fields_set - {"name", *known}):
             if self.name == "path_tracing":
                 raise ValueError(f"path_tracing takes no {name} here; its parameters are in the section bounces")
-            raise ValueError(f"{self.name} takes {', '.join(known)}, not {name}{did_you_mean(name, known)}")
+            raise ValueError(
+                f"{self.name} takes {', '.join(known) or 'no parameters'}, not {name}{did_you_mean(name, known)}"
+            )
         return self
 
     def value(self) -> Integrator:

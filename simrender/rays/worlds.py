@@ -29,6 +29,7 @@ from simrender.rays.integrators import (
     ElementMarching,
     Integrator,
     PathTracing,
+    RayCasting,
     SprayPathTracing,
     VolumeMarching,
     VolumePathTracing,
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from simrender.rays.domains import Domains
     from simrender.rays.shading import Surfaces
 
+SurfaceIntegrator = RayCasting | PathTracing | AmbientOcclusion | SprayPathTracing
 Columns = dict[str, Any]
 Ids = NDArray[np.int64]
 Report = Callable[[int], None]
@@ -110,7 +112,7 @@ class SurfaceWorld:
 
     outcome: tuple[str, ...] = ()
 
-    def __init__(self, scene: Scene, integrator: PathTracing | AmbientOcclusion | SprayPathTracing) -> None:
+    def __init__(self, scene: Scene, integrator: SurfaceIntegrator) -> None:
         if len(scene.instance_object) == 0:
             raise SceneError("the scene has no triangles; its volume needs volume_marching or volume_path_tracing")
         self.scene, self.integrator = scene, integrator
@@ -130,6 +132,10 @@ class SurfaceWorld:
 
     def shade(self, rays: Columns, hits: embree.Hits, seed: int) -> Columns:
         """Return what some rays contribute and spawn if these are their hits; runs on the calling thread."""
+        if isinstance(self.integrator, RayCasting):
+            from simrender.rays.shading import headlight
+
+            return childless(headlight(rays["direction"], self.scene.environment, hits, self.surfaces))
         if isinstance(self.integrator, PathTracing):
             from simrender.rays.shading import shade
 
@@ -214,9 +220,9 @@ class _Backdrop:
 
     def colors(self, rays: Columns, hits: embree.Hits | None) -> NDArray[np.float32]:
         """Return what each ray sees where nothing is in front, float32 (n, 3)."""
-        from simrender.rays.volume_paths import backdrop
+        from simrender.rays.shading import headlight
 
-        return backdrop(rays["direction"], self.sky, hits, self.surfaces.surfaces if self.surfaces else None)
+        return headlight(rays["direction"], self.sky, hits, self.surfaces.surfaces if self.surfaces else None)
 
 
 class MarchingWorld:
@@ -255,7 +261,8 @@ class MarchingWorld:
                 "work": marched.samples.astype(np.uint32),
             }
 
-        return childless(in_blocks(block, rays, done))
+        outcome = in_blocks(block, rays, done)
+        return outcome | childless(outcome["radiance"])
 
     def cross(self, rays: Columns, ray: Ids, domains: Domains, domain: NDArray[np.int16], seed: int) -> Columns:  # noqa: ARG002
         """See `World`; a row is a fragment, which has ``rgba`` (float32 (n, 4), premultiplied), entry and exit."""
@@ -352,7 +359,8 @@ class ElementWorld:
                 "samples": np.bincount(ray, found.samples, minlength=n).astype(np.uint32),
             }
 
-        return childless(in_blocks(block, rays, done))
+        outcome = in_blocks(block, rays, done)
+        return outcome | childless(outcome["radiance"])
 
     def cross(self, rays: Columns, ray: Ids, domains: Domains, domain: NDArray[np.int16], seed: int) -> Columns:  # noqa: ARG002
         """See `World`; domain d holds part d."""
@@ -388,7 +396,8 @@ def by_domain(domain: NDArray[np.int16]) -> Iterator[tuple[int, Ids]]:
 def joined(parts: list[Columns]) -> Columns:
     """Join columns, each on a core of its own; the parts are emptied, so that little is held twice."""
     names = list(parts[0])
-    return dict(zip(names, embree.on_all_cores(lambda n: np.concatenate([p.pop(n) for p in parts]), names), strict=True))
+    columns = embree.on_all_cores(lambda name: np.concatenate([part.pop(name) for part in parts]), names)
+    return dict(zip(names, columns, strict=True))
 
 
 def in_blocks(block: Callable[[Columns], Columns], rays: Columns, done: Report | None) -> Columns:
@@ -406,10 +415,9 @@ def in_blocks(block: Callable[[Columns], Columns], rays: Columns, done: Report |
     return joined(parts)
 
 
-def childless(outcome: Columns) -> Columns:
-    """Complete the outcome of rays that spawn none."""
-    n = len(outcome["t"])
+def childless(radiance: NDArray[np.float32]) -> Columns:
+    """Return the radiance of rays that spawn none, with no children."""
     none = {"pixel": np.int32, "sample": np.uint16, "parent": np.int32, "reach": np.float32}
     spawned = {name: np.zeros(0, none.get(name, np.uint8)) for name in SPAWNED}
     spawned |= {name: np.zeros((0, 3), np.float32) for name in ("origin", "direction", "throughput")}
-    return outcome | {"children": np.zeros(n, np.uint16)} | spawned
+    return {"radiance": radiance, "children": np.zeros(len(radiance), np.uint16)} | spawned

@@ -75,7 +75,7 @@ def _size(trace: Trace) -> str:
     if scene.volume is not None:
         parts.append(f"{' x '.join(str(n) for n in scene.volume.dims)} voxels")
     if scene.elements is not None:
-        parts.append(f"{len(scene.elements.kind):,} elements in {len(scene.elements.part_bounds[0])} parts")
+        parts.append(f"{_several(scene.elements.count, 'element')} in {_several(scene.elements.parts, 'part')}")
     if trace.world.outcome:
         parts.append(f"{int(trace.column('work').sum()):,} {unit_of_work(trace)}")
     return "; ".join(parts)
@@ -145,6 +145,9 @@ def describe_estimates(estimates: dict[str, Estimate]) -> RenderableType:
     some = next(iter(estimates.values()))
     table = _table("as published", "mean", f"{some.confidence:.0%} interval", "relative")
     for name, found in estimates.items():
+        kind = name.split()[0]
+        if kind in KINDS[1:] and float(estimates[f"{kind} rays"].mean) == 0.0:
+            continue  # there are none of this kind
         mean, half = float(found.mean), float(found.half_width)
         table.add_row(name, format_count(mean), f"± {format_count(half)}", f"± {half / mean:.2%}" if mean else "")
     return Group(table, f"from {some.replicas} independent replicas\n")
@@ -154,8 +157,9 @@ def replica_counts(workload: Workload, trace: Trace, crossings: Crossings) -> di
     """Return what a replica counts, scaled to the published frame: rays, hits, and rays that enter each domain."""
     scale = workload.weight * workload.repeats
     rays, hits = ray_counts(trace)
-    counts = {f"{kind} rays": rays[kind] * scale for kind in KINDS if rays[kind] or kind == "camera"}
-    counts |= {f"{kind} hits": hits[kind] * scale for kind in KINDS if rays[kind] or kind == "camera"}
+    # Every kind, for one replica may have rays of a kind that another has not.
+    counts = {f"{kind} rays": rays[kind] * scale for kind in KINDS}
+    counts |= {f"{kind} hits": hits[kind] * scale for kind in KINDS}
     entered = np.zeros(crossings.domains.count)
     for generation in range(trace.generations):
         entered += np.bincount(crossings.table(generation)["domain"], minlength=len(entered))

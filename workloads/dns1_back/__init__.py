@@ -1,0 +1,1 @@
+"""SpRay's smaller isosurface of the channel flow, from the back; see `workloads.dns`."""

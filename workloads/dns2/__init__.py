@@ -1,0 +1,1 @@
+"""SpRay's larger isosurface of the channel flow; see `workloads.dns`."""

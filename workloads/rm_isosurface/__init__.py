@@ -1,0 +1,1 @@
+"""The larger isosurface of the Richtmyer-Meshkov instability; see `workloads.rm`."""
