@@ -13,6 +13,9 @@ or exactly two, one inwards and one outwards; hence tetrahedra that share the tr
 without branches or loops, each from an entry to an exit on the boundary. Neighbouring parts have the same points, so
 together their chains are those of the whole mesh. Embree, in float32, promises this for one surface at a time but not
 for an entry and its exit, so the boundary has a hierarchy of its own here, with generous boxes and exact triangles.
+
+Numba keeps a compiled kernel until the kernel's own file changes: whoever edits the tables in ``elements.py`` or
+``find_row`` in ``volume.py`` must touch this file too.
 """
 
 from __future__ import annotations
@@ -396,7 +399,7 @@ def _cross(v, corner_count, shape, side, knots):  # type: ignore[no-untyped-def]
     Parameters
     ----------
     v : float64 array (9, 4)
-        The projected corners; row 8 is for their mean.
+        The projected corners; row 8 is the element's centre, their mean or a pyramid's apex.
     side : int
         The triangle of the entry.
     knots : float64 array (14, 2)
@@ -426,7 +429,7 @@ def _cross(v, corner_count, shape, side, knots):  # type: ignore[no-untyped-def]
     if corner_count == 4:
         return side, 2
     count = 2
-    # From here on the ray is in the tetrahedron of the mean and a triangle of the surface, which has the edge (a, b).
+    # From here on the ray is in the tetrahedron of the centre and a triangle of the surface that has the edge (a, b).
     while count < SIDES + 1:
         edge = 0
         while TRIANGLES[shape, side, edge] == a or TRIANGLES[shape, side, edge] == b:
@@ -434,11 +437,11 @@ def _cross(v, corner_count, shape, side, knots):  # type: ignore[no-untyped-def]
         d = TRIANGLES[shape, side, edge]
         ta = _turn(v[d, 0], v[d, 1], v[a, 0], v[a, 1])
         tb = _turn(v[d, 0], v[d, 1], v[b, 0], v[b, 1])
-        tm = _turn(v[d, 0], v[d, 1], v[8, 0], v[8, 1])
+        tc = _turn(v[d, 0], v[d, 1], v[8, 0], v[8, 1])
         if ta > 0 and tb < 0:
             break
-        # On through (b, mean, d) or (mean, a, d), into the next triangle about the mean.
-        if tb > 0 and tm < 0:
+        # On through (b, centre, d) or (centre, a, d), into the next triangle about the centre.
+        if tb > 0 and tc < 0:
             a = d
         else:
             b = d
@@ -490,16 +493,20 @@ def _march(mesh, shell, table, step, rays, row_ray, row_part):  # type: ignore[n
                     a, b, c = TRIANGLES[shape[e], side, 0], TRIANGLES[shape[e], side, 1], TRIANGLES[shape[e], side, 2]
                     knots[0, 0], knots[0, 1] = _meet(v, a, b, c)
                     fresh = False
-                if k > 4:
+                if k == 5:
+                    for axis in range(4):
+                        v[8, axis] = v[4, axis]
+                elif k > 5:
                     for axis in range(4):
                         total = 0.0
                         for j in range(k):
                             total += v[j, axis]
                         v[8, axis] = total / k
                 side, last = _cross(v, k, shape[e], side, knots)
-                # Rounding must not make a ray step back.
-                for j in range(1, last):
-                    knots[j, 0] = max(knots[j, 0], knots[j - 1, 0])
+                # Neither rounding nor a badly warped element may make a ray step back, or out of the element.
+                knots[last - 1, 0] = max(knots[last - 1, 0], knots[0, 0])
+                for j in range(1, last - 1):
+                    knots[j, 0] = min(max(knots[j, 0], knots[j - 1, 0]), knots[last - 1, 0])
                 low, high = max(knots[0, 0], 0.0), min(knots[last - 1, 0], reach)
                 if knots[last - 1, 0] > 0.0 and low < reach:
                     walked[i] += 1

@@ -2,9 +2,9 @@
 
 Four points need not lie in a plane, so the quadrilateral faces of an element have no shape of their own. Here each is
 two triangles, parted along the diagonal through its point of the lowest id. Both elements at a face follow that rule,
-so all elements are polyhedra of triangles that fill space without gaps or overlaps, however warped they are. An element
-that is not a tetrahedron is the tetrahedra between its triangles and the mean of its corners, and its scalar is linear
-in each of them: continuous everywhere, and exact for a linear field.
+so all elements are polyhedra of triangles that fill space without gaps or overlaps, however warped they are. A pyramid
+is two tetrahedra at its apex, a wedge or hexahedron those between its triangles and the mean of its corners. The scalar
+is linear in each of them: continuous everywhere, and exact for a linear field.
 
 A mesh comes *pre-partitioned*, as simulations write it (islands paper, section 7.2): every element belongs to a part.
 The boundary of a part is what only one of its elements has, also where another part goes on.

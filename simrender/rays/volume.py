@@ -8,7 +8,7 @@ Lyapunov exponent fields", Computer Graphics Forum 35(3), 2016; islands paper, s
 macro cells, an int32 row (x0, x1, y0, y1, z0, z1) of the cells x0 <= i < x1 and so on.
 
 Numba keeps a compiled kernel until the kernel's own file changes: whoever edits the jitted functions here must touch
-``marching.py`` and ``tracking.py`` too.
+``marching.py``, ``tracking.py`` and ``element_marching.py`` too.
 """
 
 from __future__ import annotations

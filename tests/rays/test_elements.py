@@ -219,8 +219,14 @@ def test_key_and_units():
         ),
         ({"points": np.zeros((8, 2))}, r"points are an array \(p, 3\)"),
         ({"scalars": np.zeros(7)}, r"scalars \(p,\), got \(8, 3\) and \(7,\)"),
-        ({"corners": np.array([0, 1, 2, 3, 4, 5, 6, 8])}, "outside the 8 points; the first is 8 of element 0, a hexah"),
-        ({"corners": np.array([0, 1, 2, 3, 4, 5, 6, -1])}, "1 corners of elements point outside"),
+        (
+            {"corners": np.array([0, 1, 2, 3, 4, 5, 6, 8])},
+            "1 corner of an element is outside the 8 points; the first is 8 of element 0, a hexahedron",
+        ),
+        (
+            {"corners": np.array([0, 1, 2, 3, 4, 5, 6, -1])},
+            "1 corner of an element is outside the 8 points; the first is -1",
+        ),
         ({"kind": np.array([7])}, "element 0 has 7 corners .known: 4 tetrahedron, 5 pyramid, 6 wedge, 8 hexahedron"),
         ({"kind": np.array([], int)}, "the mesh is empty"),
         ({"part": np.array([-1])}, "numbered from 0 on, got part -1 of element 0"),
@@ -270,7 +276,7 @@ def test_hexbeam(hexbeam):
 
 
 def test_all_kinds_parts_and_voxels_are_read_and_surfaces_skipped(tmp_path):
-    points = np.concatenate([np.array(CELLS[k]) + [3.0 * i, 0, 0] for i, k in enumerate((4, 5, 6, 8))])
+    points = np.concatenate([np.add(CELLS[k], (3.0 * i, 0, 0)) for i, k in enumerate((4, 5, 6, 8))])
     voxel = np.array(CELLS[8])[[0, 1, 3, 2, 4, 5, 7, 6]] + [12.0, 0, 0]
     points = np.concatenate([points, voxel])
     cells = {5: [[0, 1, 2]], 10: [range(4)], 14: [range(4, 9)], 13: [range(9, 15)], 12: [range(15, 23)]}
@@ -290,7 +296,7 @@ def test_cell_data_are_averaged_to_points(tmp_path):
 
 
 def test_without_any_array_the_height_takes_its_place(tmp_path):
-    path = save(tmp_path / "bare.vtu", {10: [range(4)]}, np.array(CELLS[4]) + [0, 0, 5])
+    path = save(tmp_path / "bare.vtu", {10: [range(4)]}, np.add(CELLS[4], (0, 0, 5)))
     with pytest.warns(SceneWarning, match=r"bare.vtu: no array with one number a point or cell; the height"):
         elements = read_elements(path)
     assert elements.scalars.tolist() == [0, 0, 0, 1]

@@ -1,0 +1,1 @@
+"""The huge version of the Mars lander, 552 parts; see `workloads.lander`."""
