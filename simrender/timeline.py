@@ -19,6 +19,11 @@ KERNELS: Final = ("generate", "trace", "shade", "tonemap", "assemble")
 COPIES: Final = ("copy", "merge")
 """Spans during which a GPU sends: ray queues, and finished pixels."""
 
+PHASES: Final = ("load", "sync")
+"""Spans during which a rank waits for its data, or for other ranks in a collective."""
+
+KINDS: Final = KERNELS + COPIES + PHASES
+
 
 @dataclass
 class Timeline:
@@ -31,7 +36,7 @@ class Timeline:
     names : list of str
         Theirs; ``gpu0``, ``gpu1`` ... unless given.
     device, kind, start, end : list of int
-        Index of the GPU, index into ``KERNELS + COPIES``, and the ticks.
+        Index of the GPU, index into `KINDS`, and the ticks.
     nbytes, rays : list of float
         What a span moved or worked on, at published size.
 
@@ -74,7 +79,7 @@ class Timeline:
         """Return the spans as a table: device, kind, start_s, end_s, bytes, rays; sorted by start, then device."""
         import pandas as pd
 
-        names = np.array(KERNELS + COPIES)
+        names = np.array(KINDS)
         table = pd.DataFrame(
             {
                 "device": [self.names[d] for d in self.device],
@@ -94,5 +99,5 @@ class Timeline:
         seconds = (np.array(self.end, dtype=float) - np.array(self.start, dtype=float)) / TICKS_PER_SECOND
         return {
             name: np.bincount(device[kind == k], seconds[kind == k], minlength=self.gpus).tolist()
-            for k, name in enumerate(KERNELS + COPIES)
+            for k, name in enumerate(KINDS)
         }

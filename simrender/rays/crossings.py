@@ -1,10 +1,10 @@
 """The crossing table: which rays enter which domains, and what they meet there.
 
-Rows are (ray, domain) pairs, grouped by ray and front to back within a ray. A row's hit is unknown (NaN) until somebody
-asks; then the ray is taken through that domain alone and the answer is kept, in memory and on disk. A scheduler asks
-only as finely as it can tell apart. Ray queue cycling traces every ray on every rank, so of a shadow ray that something
-occludes it must know the first domain *on the ray's way around the ring* that does, and no other hit at all: for it
-there is a table of the occluded shadow rays alone.
+Rows are (ray, domain) pairs, grouped by ray and front to back within a ray: by entry, then by where the ray leaves,
+then by number. A row's hit is unknown (NaN) until somebody asks; then the ray is taken through that domain alone and
+the answer is kept, in memory and on disk. A scheduler asks only as finely as it can tell apart. Ray queue cycling
+traces every ray on every rank, so of a shadow ray that something occludes it must know the first domain *on the ray's
+way around the ring* that does, and no other hit at all: for it there is a table of the occluded shadow rays alone.
 
 ========== ===== ===================================================================
 column     dtype meaning
@@ -163,6 +163,7 @@ class Crossings:
         else:
             entered = enter_boxes(*geometry, domains.low, domains.high, growth=0.0)
         first, domain, entry = entered.first, entered.domain, entered.entry
+        _leave_first(first, domain, entry, geometry[0], geometry[1], domains.low, domains.high)
         del entered  # where rows are added, the old ones need not stay
         nearest = None
         if domains.domain_of_triangle is not None:
@@ -189,6 +190,40 @@ class Crossings:
             table[name][rows] = found[name]
         self.asked_rows += len(rows)
         self._changed.add(f"{generation:03d}-{which}-{self.domains.key}")
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _leave_first(first, domain, entry, origin, direction, low, high):  # type: ignore[no-untyped-def]
+    """Put domains that a ray enters at the same distance in the order in which it leaves them.
+
+    A ray that passes an edge between boxes touches some of them in a point: these come before the one it goes on in.
+    """
+    for i in range(len(first) - 1):
+        row = first[i]
+        while row + 1 < first[i + 1]:
+            end = row + 1
+            while end < first[i + 1] and entry[end] == entry[row]:
+                end += 1
+            for j in range(row + 1, end):
+                d = domain[j]
+                leaves = _exit(origin, direction, i, low, high, d)
+                k = j
+                while k > row and _exit(origin, direction, i, low, high, domain[k - 1]) > leaves:
+                    domain[k] = domain[k - 1]
+                    k -= 1
+                domain[k] = d
+            row = end
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _exit(origin, direction, i, low, high, d):  # type: ignore[no-untyped-def]
+    far = np.inf
+    for axis in range(3):
+        step = np.float64(direction[i, axis])
+        if step != 0.0:
+            plane = np.float64(high[d, axis]) if step > 0.0 else np.float64(low[d, axis])
+            far = min(far, (plane - np.float64(origin[i, axis])) / step)
+    return far
 
 
 def _with_nearest(

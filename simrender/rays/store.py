@@ -25,7 +25,7 @@ FORMAT_VERSION = 3
 
 _TRANSPORT = (
     "scene", "shading", "lighting", "sampling", "volume", "marching", "tracking", "volume_paths", "elements",
-    "element_marching", "compositing", "worlds",
+    "element_marching", "compositing", "worlds", "crossings",
 )  # fmt: skip
 """The modules that decide what is stored."""
 

@@ -92,7 +92,9 @@ def visits(crossings: Crossings) -> Visits:
         back = np.zeros(len(t), np.bool_)
         lost = _visit(*arguments, count, np.zeros(0, np.int16), back)
         if lost >= 0:
-            raise InvariantError(f"ray {rays.start + lost} hits something in domain {mine[lost]}, which it never enters")
+            raise InvariantError(
+                f"ray {rays.start + lost} hits something in domain {mine[lost]}, which it never enters"
+            )
         np.cumsum(count, out=count)
         domain = np.empty(count[-1], np.int16)
         _visit(*arguments, count, domain, back)
@@ -125,9 +127,7 @@ def _none_overlap(low, high):  # type: ignore[no-untyped-def]
         for j in range(i + 1, len(low)):
             if low[j, 0] >= high[i, 0]:
                 break
-            if (
-                low[j, 1] < high[i, 1] and low[i, 1] < high[j, 1] and low[j, 2] < high[i, 2] and low[i, 2] < high[j, 2]
-            ):
+            if low[j, 1] < high[i, 1] and low[i, 1] < high[j, 1] and low[j, 2] < high[i, 2] and low[i, 2] < high[j, 2]:
                 return False
     return True
 

@@ -1,0 +1,192 @@
+"""What the ranks of a simulation share when rays are scheduled by domain: who has which data, and who has which ray."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+import simpy
+from numpy.typing import NDArray
+
+from simrender.hardware.cache import DomainCache
+from simrender.hardware.collectives import Communicator
+from simrender.hardware.machine import Machine
+from simrender.rays.crossings import Crossings
+from simrender.rays.kinds import CAMERA, SHADOW
+from simrender.rays.visits import Visits
+from simrender.timeline import Timeline
+
+if TYPE_CHECKING:
+    from simrender.policies.domain_rank import DomainRank
+
+Ids = NDArray[np.int64]
+Steps = Generator[simpy.Event, Any, Any]
+
+
+class DomainPolicy(Protocol):
+    """A scheduler that decides which rays meet which domain when: a frozen dataclass, its fields its parameters."""
+
+    @property
+    def in_situ(self) -> bool:
+        """Whether domains stay with the ranks that own them, and rays travel."""
+
+    @property
+    def cache(self) -> str | int:
+        """How much of the data a rank's domain cache holds; see `cache_capacity`."""
+
+    @property
+    def threads(self) -> int | None:
+        """How many of a processor's cores trace; all by default."""
+
+    def rank(self, me: DomainRank) -> Steps:
+        """Render the frame on one rank."""
+
+
+@dataclass
+class Counters:
+    """How much of everything there was, over all ranks; rays are traced ones.
+
+    Attributes
+    ----------
+    visits, loads : int
+        Domains that were scheduled, one rank at a time; those of them that had to be loaded.
+    loaded_bytes : float
+        As published.
+    radiance_tests, shadow_tests : int
+        Queries of a ray in a domain.
+    steps : int
+        Rounds of a bulk-synchronous schedule, or visits of the busiest rank.
+    messages, sent_rays : int
+    sent_bytes : float
+        As published.
+    critical_tests : int
+        Sum over the steps of the busiest rank's tests.
+
+    """
+
+    visits: int = 0
+    loads: int = 0
+    loaded_bytes: float = 0.0
+    radiance_tests: int = 0
+    shadow_tests: int = 0
+    steps: int = 0
+    messages: int = 0
+    sent_rays: int = 0
+    sent_bytes: float = 0.0
+    critical_tests: int = 0
+
+
+@dataclass(frozen=True)
+class Event:
+    """One visit of the schedule, as `--explain schedule` prints it.
+
+    Attributes
+    ----------
+    rank, step, domain : int
+    loaded : bool
+    radiance_tests, shadow_tests : int
+
+    """
+
+    rank: int
+    step: int
+    domain: int
+    loaded: bool
+    radiance_tests: int
+    shadow_tests: int
+
+
+@dataclass
+class DomainFrame:
+    """The state that the ranks of one simulation share.
+
+    Attributes
+    ----------
+    env, machine, crossings, policy, timeline
+        What is simulated.
+    visits : Visits
+        Of all rays, without speculation.
+    comm : Communicator
+    owner : int64 array (domains,) or None
+        The rank that holds each domain; None where every rank loads what it needs.
+    rank_of_pixel : int64 array (pixels,)
+    weight : float
+        Published rays for which a traced ray stands.
+    published : (width, height)
+
+    """
+
+    env: simpy.Environment
+    machine: Machine
+    crossings: Crossings
+    visits: Visits
+    policy: DomainPolicy
+    timeline: Timeline
+    comm: Communicator | None
+    owner: NDArray[np.int64] | None
+    rank_of_pixel: NDArray[np.int64]
+    caches: list[DomainCache]
+    weight: float
+    published: tuple[int, int]
+    counters: Counters = field(default_factory=Counters)
+    events: list[Event] = field(default_factory=list)
+    retired: list[Ids] = field(default_factory=list)
+    outbox: dict[tuple[int, int, int], tuple[Ids, NDArray[np.int16]]] = field(default_factory=dict)
+    gathered: dict[int, list[NDArray[np.int64]]] = field(default_factory=dict)
+    tests_of_step: dict[int, dict[int, int]] = field(default_factory=dict)
+    peak_rays: list[int] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        trace = self.crossings.trace
+        self.trace, self.domains = trace, self.crossings.domains
+        self.ranks = len(self.caches)
+        kind = trace.column("kind")
+        self.coherent, self.shadow = kind == CAMERA, kind == SHADOW
+        self.position = self.visits.first[:-1].copy()
+        """The next visit of each ray."""
+        self.peak_rays = [0] * self.ranks
+        if self.owner is not None:
+            self.owned_by_rank = [np.flatnonzero(self.owner == rank) for rank in range(self.ranks)]
+
+
+def stripes(size: tuple[int, int], ranks: int) -> NDArray[np.int64]:
+    """Return the rank of each pixel when each takes a horizontal stripe, from the lowest line up.
+
+    All stripes have as many lines, but the last one, which takes the rest (as SpRay's program cuts its image).
+
+    Parameters
+    ----------
+    size : (width, height)
+    ranks : int
+
+    """
+    width, height = size
+    up = height - 1 - np.arange(width * height) // width
+    lines = height // ranks
+    return np.minimum(up // lines, ranks - 1) if lines else np.minimum(up, ranks - 1)
+
+
+def cache_capacity(cache: str | int, domains: int) -> int:
+    """Return how many domains a cache holds that is given as a number of them, or a share such as ``25%``.
+
+    A share is rounded to the nearest whole number of domains; a cache holds one at least.
+
+    Raises
+    ------
+    ValueError
+        If it is neither.
+
+    """
+    text = str(cache).strip()
+    if text == "all":
+        return max(1, domains)
+    if text.endswith("%"):
+        share = float(text[:-1])
+        if not 0.0 < share <= 100.0:
+            raise ValueError(f"expected a share of the domains above 0% and up to 100%, got {cache!r}")
+        return max(1, round(domains * share / 100.0))
+    if not text.isdigit() or int(text) < 1:
+        raise ValueError(f"expected a number of domains from 1 on, a share such as 25%, or all, got {cache!r}")
+    return min(int(text), max(1, domains))

@@ -1,0 +1,208 @@
+"""What a scheduler of rays and domains may do: the operations of a rank, the cores of a node or a GPU.
+
+A policy is a generator a rank. It moves rays, by id; durations come from the devices: a domain that is not in the cache
+is read, parsed and built into a hierarchy, rays are traced on the rank's processor, and messages cross the network.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import simpy
+from numpy.typing import NDArray
+
+from simrender.errors import InvariantError
+from simrender.policies.domain_frame import DomainFrame, Event, Steps
+from simrender.policies.queues import DomainQueues
+from simrender.timeline import COPIES, KERNELS, PHASES
+
+Ids = NDArray[np.int64]
+
+TRACE = KERNELS.index("trace")
+MERGE = len(KERNELS) + COPIES.index("merge")
+COPY = len(KERNELS) + COPIES.index("copy")
+LOAD, SYNC = (len(KERNELS) + len(COPIES) + PHASES.index(name) for name in ("load", "sync"))
+
+PIXEL_BYTES = 16
+"""A pixel of the image that ranks add up: four floats, as SpRay's program sends them."""
+
+COUNT_BYTES = 8
+"""A count of rays that ranks add up."""
+
+
+class DomainRank:
+    """One rank, as a policy sees it.
+
+    Attributes
+    ----------
+    index : int
+    ranks : int
+        How many there are.
+    queues : DomainQueues
+        Its ray batch queues.
+    owned : int64 array
+        The domains that stay with it; all of them where domains are loaded.
+
+    """
+
+    def __init__(self, frame: DomainFrame, index: int) -> None:
+        self._frame, self.index, self.ranks = frame, index, frame.ranks
+        self._processor = frame.machine.processor(index)
+        self.queues = DomainQueues(frame.domains.count)
+        self.cache = frame.caches[index]
+        self.owned = np.arange(frame.domains.count)
+        if frame.owner is not None:
+            self.owned = np.flatnonzero(frame.owner == index)
+        self.comm = None if frame.comm is None else frame.comm.rank(index)
+        self.owned_by_rank = [self.owned]
+        if frame.owner is not None:
+            self.owned_by_rank = frame.owned_by_rank
+        self.step = 0
+        self._collectives = 0
+
+    # -- rays -----------------------------------------------------------------------------------------------------
+
+    def camera_rays(self) -> Ids:
+        """Return the camera rays of this rank's pixels that enter a domain; the others are done."""
+        frame = self._frame
+        count = frame.trace.first[1]
+        mine = np.flatnonzero(frame.rank_of_pixel[frame.trace.column("pixel")[:count]] == self.index)
+        meets = frame.visits.first[mine + 1] > frame.visits.first[mine]
+        self.retire(mine[~meets])
+        return mine[meets]
+
+    def enqueue(self, rays: Ids) -> None:
+        """Queue rays for the domains of their next visits."""
+        self.queues.put(rays, self._frame.visits.domain[self._frame.position[rays]])
+        frame = self._frame
+        frame.peak_rays[self.index] = max(frame.peak_rays[self.index], int(self.queues.counts.sum()))
+
+    def advance(self, rays: Ids) -> tuple[Ids, Ids]:
+        """Take rays past the visit they just made; return those that go on to another domain, and those that end."""
+        frame = self._frame
+        frame.position[rays] += 1
+        goes_on = frame.position[rays] < frame.visits.last[rays]
+        return rays[goes_on], rays[~goes_on]
+
+    def by_kind(self, rays: Ids) -> tuple[Ids, Ids]:
+        """Return the shadow rays and the radiance rays among some rays."""
+        shadow = self._frame.shadow[rays]
+        return rays[shadow], rays[~shadow]
+
+    def shade(self, rays: Ids) -> Ids:
+        """Shade rays that are done, add what they bring to the image, and return those that they spawn."""
+        self.retire(rays)
+        return self._frame.trace.children(rays)
+
+    def retire(self, rays: Ids) -> None:
+        """Add what rays contribute to the image."""
+        if len(rays):
+            self._frame.retired.append(rays)
+
+    # -- the processor and the data -------------------------------------------------------------------------------
+
+    def load(self, domain: int) -> Steps:
+        """Have a domain in memory: take it from the cache, or read, parse and build it."""
+        frame = self._frame
+        frame.counters.visits += 1
+        self.step += 1
+        self._loaded = False
+        if frame.owner is not None or self.cache.touch(domain):
+            return
+        self.cache.load(domain)
+        self._loaded = True
+        begin = int(frame.env.now)
+        nbytes, primitives = float(frame.domains.bytes[domain]), float(frame.domains.primitives[domain])
+        yield from frame.machine.load(self.index, nbytes, primitives)
+        frame.counters.loads += 1
+        frame.counters.loaded_bytes += nbytes
+        frame.timeline.add(self.index, LOAD, begin, int(frame.env.now), nbytes, 0.0)
+
+    def trace(self, domain: int, rays: Ids) -> Steps:
+        """Query a domain for the hits of radiance rays and the occlusion of shadow rays."""
+        frame = self._frame
+        position = frame.position[rays]
+        # A ray that comes back to be shaded tests nothing.
+        asks = ~(frame.visits.returns[rays] & (position + 1 == frame.visits.last[rays]))
+        asking = rays[asks]
+        shadow, coherent = int(frame.shadow[asking].sum()), int(frame.coherent[asking].sum())
+        incoherent = len(asking) - coherent
+        yield from self.compute(domain, coherent, incoherent)
+        frame.counters.shadow_tests += shadow
+        frame.counters.radiance_tests += len(asking) - shadow
+        self._tests[0] += len(asking) - shadow
+        self._tests[1] += shadow
+
+    def compute(self, domain: int, coherent: float, incoherent: float) -> Steps:
+        """Run a trace kernel over a domain; rays are traced ones."""
+        frame = self._frame
+        weight, primitives = frame.weight, float(frame.domains.primitives[domain])
+        seconds = self._processor.trace_seconds(coherent * weight, incoherent * weight, primitives)
+        cores = getattr(self._processor.card, "cores", None)
+        if frame.policy.threads and cores:
+            seconds *= cores / min(frame.policy.threads, cores)
+        begin, end = self._processor.run(seconds, int(frame.env.now))
+        yield frame.env.timeout(end - int(frame.env.now))
+        frame.timeline.add(self.index, TRACE, begin, end, 0.0, (coherent + incoherent) * weight)
+
+    def begin_visit(self) -> None:
+        """Begin to count a visit's tests."""
+        self._tests = [0, 0]
+
+    def end_visit(self, domain: int) -> None:
+        """Log a visit."""
+        frame = self._frame
+        frame.events.append(Event(self.index, self.step, domain, self._loaded, *self._tests))
+
+    # -- other ranks ----------------------------------------------------------------------------------------------
+
+    def allreduce(self, counts: NDArray[np.int64]) -> Steps:
+        """Add up counts over all ranks."""
+        frame = self._frame
+        if self.comm is None:
+            return counts
+        call = self._collectives
+        self._collectives += 1
+        frame.gathered.setdefault(call, []).append(counts.copy())
+        begin = int(frame.env.now)
+        yield self.comm.allreduce(float(COUNT_BYTES * len(counts)))
+        frame.timeline.add(self.index, SYNC, begin, int(frame.env.now), 0.0, 0.0)
+        return np.sum(frame.gathered[call], axis=0)
+
+    def send(self, target: int, rays: Ids, tag: int, nbytes: float) -> simpy.Event:
+        """Send rays to another rank; done when they have left."""
+        frame = self._frame
+        assert self.comm is not None  # noqa: S101 - there is another rank
+        frame.outbox[self.index, target, tag] = rays, frame.visits.domain[frame.position[rays]]
+        frame.counters.messages += 1
+        frame.counters.sent_rays += len(rays)
+        frame.counters.sent_bytes += nbytes * frame.weight
+        return self.comm.isend(target, nbytes * frame.weight, tag)
+
+    def receive(self, rays: int) -> Steps:
+        """Wait for messages until so many rays have come; return them."""
+        frame = self._frame
+        got = [np.zeros(0, np.int64)]
+        while sum(map(len, got)) < rays:
+            assert self.comm is not None  # noqa: S101 - there is another rank
+            message = yield self.comm.irecv()
+            got.append(frame.outbox.pop((message.source, self.index, message.tag))[0])
+        found = np.concatenate(got)
+        if len(found) != rays:
+            raise InvariantError(f"rank {self.index} got {len(found)} rays and expected {rays}")
+        return found
+
+    def barrier(self) -> Steps:
+        """Wait for all ranks."""
+        if self.comm is not None:
+            begin = int(self._frame.env.now)
+            yield self.comm.barrier()
+            self._frame.timeline.add(self.index, SYNC, begin, int(self._frame.env.now), 0.0, 0.0)
+
+    def merge_frame(self) -> Steps:
+        """Add up the images of all ranks on rank 0."""
+        frame = self._frame
+        if self.comm is None:
+            return
+        begin = int(frame.env.now)
+        yield self.comm.reduce(float(PIXEL_BYTES * frame.published[0] * frame.published[1]))
+        frame.timeline.add(self.index, MERGE, begin, int(frame.env.now), 0.0, 0.0)

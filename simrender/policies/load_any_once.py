@@ -1,0 +1,127 @@
+"""LoadAnyOnce: always process the domain for which most rays wait.
+
+Pharr et al., "Rendering complex scenes with memory-coherent ray tracing" (1997), out of core; Navratil et al.,
+"Exploring the spectrum of dynamic scheduling algorithms for scalable distributed-memory ray tracing" (2014), over ranks;
+both as Park, Fussell and Navratil, "SpRay: speculative ray scheduling for large data visualization" (2018), section 3
+and listing 1, have them for their baselines.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+
+from simrender.policies.domain_frame import Steps
+from simrender.policies.domain_rank import DomainRank
+from simrender.policies.queues import fullest
+
+Ids = NDArray[np.int64]
+
+SHADOW, RADIANCE = 0, 1
+"""Message tags."""
+
+
+@dataclass(frozen=True)
+class LoadAnyOnce:
+    """Schedule the domain with most queued rays; load it, or send the rays to the rank that has it.
+
+    Parameters
+    ----------
+    data : "out_of_core", "in_situ" or "global"
+        Every rank renders its stripe of the image and loads domains into its cache (SpRay, 3 and 5). Or each domain
+        stays with its owner, contiguous blocks in Morton order, and rays travel in bulk-synchronous rounds: every rank
+        takes the fullest of its own domains (SpRay, 5). Or the i-th fullest domain of all goes to rank i, which loads
+        it, and rays travel as well (Navratil et al.).
+    cache : str
+        Domains in a rank's cache: a number, a share such as 25%, or all. Least recently used ones make room.
+    prefer_cached : bool
+        Take the fullest domain in the cache before any other.
+    ray_bytes : float
+        Size of a ray in a message: 96 B in the authors' program.
+    threads : int, optional
+        Cores of a rank that trace; all by default. The paper's in situ renderers use one.
+
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+
+    data: Literal["out_of_core", "in_situ", "global"] = "out_of_core"
+    cache: str | int = "all"
+    prefer_cached: bool = False
+    ray_bytes: Annotated[float, Field(gt=0)] = 96.0
+    threads: Annotated[int, Field(ge=1)] | None = None
+
+    @property
+    def in_situ(self) -> bool:
+        """Whether domains stay with their owners."""
+        return self.data == "in_situ"
+
+    def rank(self, me: DomainRank) -> Steps:
+        """Render one frame."""
+        me.enqueue(me.camera_rays())
+        if self.data == "out_of_core":
+            while (domain := self.choose(me)) is not None:
+                yield from self.visit(me, domain)
+        else:
+            yield from self.rounds(me)
+        yield from me.merge_frame()
+
+    def choose(self, me: DomainRank) -> int | None:
+        """Choose a domain with most rays (listing 1, line 2)."""
+        cached = fullest(me.queues.counts, me.cache.resident) if self.prefer_cached else None
+        return fullest(me.queues.counts) if cached is None else cached
+
+    def visit(self, me: DomainRank, domain: int) -> Steps:
+        """Load a domain and process the rays that wait for it (listing 1, lines 3 to 17).
+
+        Shadow rays, and secondary rays as well, are tested in the domain of their birth before they leave it.
+        """
+        me.begin_visit()
+        yield from me.load(domain)
+        rays = me.queues.take(domain)
+        while len(rays):
+            yield from me.trace(domain, rays)
+            onward, done = me.advance(rays)
+            me.enqueue(onward)
+            rays = me.shade(done)
+        me.end_visit(domain)
+
+    def rounds(self, me: DomainRank) -> Steps:
+        """Agree on a schedule, send the rays to where it says, process them; until no ray waits anywhere."""
+        while True:
+            waiting = yield from me.allreduce(me.queues.counts)
+            if not waiting.any():
+                return
+            schedule = self.schedule(me, waiting)
+            yield from self.exchange(me, schedule, waiting)
+            domain = schedule.get(me.index)
+            if domain is not None:
+                yield from self.visit(me, domain)
+            yield from me.barrier()
+
+    def schedule(self, me: DomainRank, waiting: NDArray[np.int64]) -> dict[int, int]:
+        """Return the domain of each rank that has one this round: the same on all ranks."""
+        if self.data == "in_situ":
+            chosen = {rank: fullest(waiting, domains) for rank, domains in enumerate(me.owned_by_rank)}
+            return {rank: domain for rank, domain in chosen.items() if domain is not None}
+        order = np.argsort(-waiting, kind="stable")[: me.ranks]
+        return {rank: int(domain) for rank, domain in enumerate(order) if waiting[domain] > 0}
+
+    def exchange(self, me: DomainRank, schedule: dict[int, int], waiting: NDArray[np.int64]) -> Steps:
+        """Send the rays that wait here for the domains of other ranks, and receive those for this rank's own."""
+        leaving = []
+        for rank, domain in schedule.items():
+            if rank != me.index and me.queues.counts[domain] > 0:
+                shadow, radiance = me.by_kind(me.queues.take(domain))
+                for tag, rays in ((SHADOW, shadow), (RADIANCE, radiance)):
+                    if len(rays):
+                        leaving.append(me.send(rank, rays, tag, len(rays) * self.ray_bytes))
+        if me.index in schedule:
+            domain = schedule[me.index]
+            me.enqueue((yield from me.receive(int(waiting[domain] - me.queues.counts[domain]))))
+        for event in leaving:
+            yield event
