@@ -334,6 +334,7 @@ def run(
     json: Annotated[str | None, Parameter(negative="")] = None,
     image: Flag = None,
     timeline: Flag = None,
+    explain: Literal["schedule"] | None = None,
     cache: Flag = None,
 ) -> int:
     """Render one frame in simulated time: how fast, with what error, and where the time goes.
@@ -362,6 +363,8 @@ def run(
         Write the picture (.png), at traced size.
     timeline
         Write the timeline as a Chrome trace for Perfetto (.json) or as a plot (.png).
+    explain
+        Print the first steps of a schedule of domains: which rays wait where, and what is processed and loaded.
     cache
         Folder of the trace cache; by default $SIMRENDER_CACHE or ~/.cache/simrender.
 
@@ -388,6 +391,10 @@ def run(
         )  # fmt: skip
     seconds = time.perf_counter() - begin
     _publish(result, json)
+    if explain and result.frame_time_s is not None:
+        from simrender.report.schedule import explain_schedule
+
+        _console(stderr=json == "-").print(explain_schedule(result))
     if result.image is not None:
         if image:
             write_image(image, result.image)

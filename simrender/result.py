@@ -13,12 +13,15 @@ from numpy.typing import NDArray
 from simrender.cards import UNCALIBRATED, Quantity
 from simrender.errors import InvariantError
 from simrender.hardware.machine import Machine
+from simrender.policies.domain_frame import Event, Moment
 from simrender.policies.frame import Frame
 from simrender.rays.kinds import KINDS, SHADOW
 from simrender.timeline import KERNELS, Timeline
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from simrender.rays.trace import Trace
 
 LEFT_OUT = (
     (
@@ -69,6 +72,8 @@ class Result:
     spans : Timeline or None
     loads : dict
         Of the same links, the ticks at which a load changed (int64 array), and the B/s from then on (float64 array).
+    schedule, events : list
+        Of schedulers of domains: the queues before each of the first steps, and every visit of a domain.
 
     """
 
@@ -96,6 +101,8 @@ class Result:
     image: NDArray[np.float32] | None = None
     spans: Timeline | None = None
     loads: dict[str, tuple[NDArray[np.int64], NDArray[np.float64]]] = field(default_factory=dict)
+    schedule: list[Moment] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
 
     @property
     def busiest_link(self) -> str | None:
@@ -113,8 +120,8 @@ class Result:
         return (self.spans or Timeline(0)).frame()
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything but the image, the timeline and the loads of the links, ready for JSON."""
-        names = [n for n in self.__dataclass_fields__ if n not in {"image", "spans", "loads"}]
+        """Return everything but the image, the timeline, the loads of links and the schedule, ready for JSON."""
+        names = [n for n in self.__dataclass_fields__ if n not in {"image", "spans", "loads", "schedule", "events"}]
         facts = {name: getattr(self, name) for name in names}
         place = names.index("frame_time_s") + 1
         return dict([*list(facts.items())[:place], ("frames_per_s", self.frames_per_s), *list(facts.items())[place:]])
@@ -130,26 +137,46 @@ def sampling_error(frame: Frame) -> dict[str, Any]:
     more than they really would, so that the frame comes out too slow.
     """
     trace, published, owner = frame.trace, frame.published, frame.owner
-    pixel = trace.column("pixel")
-    rays = np.bincount(pixel, minlength=trace.pixels).reshape(trace.size[1], trace.size[0]).astype(np.float64)
+    facts = rays_error(trace, published)
+    of_rays, share = facts["rays_relative_standard_error"], min(1.0, trace.pixels / (published[0] * published[1]))
+    if frame.wave_mean > 0.0:
+        excess = frame.wave_excess / frame.wave_mean
+    else:  # the ranks met only at the end
+        rays = np.bincount(trace.column("pixel"), minlength=trace.pixels)
+        by_rank = np.bincount(owner, rays, minlength=frame.layout.ranks)
+        excess = float(by_rank.max() / by_rank.mean() - 1.0)
+    of_waiting = excess * (1.0 - float(np.sqrt(share)))
+    return facts | {"relative_error": float(np.hypot(of_rays, of_waiting)), "waiting_relative_bias": of_waiting}
+
+
+def rays_error(trace: Trace, published: tuple[int, int]) -> dict[str, Any]:
+    """Estimate the error of the number of rays, as a share of it, that comes from tracing fewer pixels."""
+    rays = np.bincount(trace.column("pixel"), minlength=trace.pixels).astype(np.float64)
+    rays = rays.reshape(trace.size[1], trace.size[0])
     differences = [np.diff(rays, axis=axis) for axis in (0, 1)]
     count = sum(d.size for d in differences)
     variance = sum(float((d * d).sum()) for d in differences) / (2.0 * count) if count else 0.0
     share = min(1.0, trace.pixels / (published[0] * published[1]))
     of_rays = float(np.sqrt(variance * (1.0 - share) / trace.pixels) / rays.mean())
-    if frame.wave_mean > 0.0:
-        excess = frame.wave_excess / frame.wave_mean
-    else:  # the ranks met only at the end
-        by_rank = np.bincount(owner, rays.ravel(), minlength=frame.layout.ranks)
-        excess = float(by_rank.max() / by_rank.mean() - 1.0)
-    of_waiting = excess * (1.0 - float(np.sqrt(share)))
     return {
-        "relative_error": float(np.hypot(of_rays, of_waiting)),
+        "relative_error": of_rays,
         "rays_relative_standard_error": of_rays,
-        "waiting_relative_bias": of_waiting,
+        "waiting_relative_bias": 0.0,
         "traced_pixels": trace.pixels,
         "published_pixels": published[0] * published[1],
     }
+
+
+def share_of_kinds(timeline: Timeline, frame_time_s: float) -> dict[str, float]:
+    """Return shares of the frame for an average rank whose phases follow one another: they add up."""
+    shares = {k: sum(s) / len(s) / frame_time_s for k, s in timeline.seconds_by_kind().items()}
+    merged = {
+        "load": shares["load"],
+        "trace": shares["trace"],
+        "copy": shares["copy"] + shares["merge"],
+        "sync": shares["sync"],
+    }
+    return {**merged, "wait": max(0.0, 1.0 - sum(merged.values()))}
 
 
 def breakdown(timeline: Timeline, frame_time_s: float) -> dict[str, float]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -14,14 +13,16 @@ from numpy.typing import NDArray
 from simrender.cards import Document
 from simrender.catalog import find_policy, policies
 from simrender.clock import to_seconds
+from simrender.domain_simulation import check_retired, check_scene, image_hash, place, render
 from simrender.errors import InvariantError, UsageError, did_you_mean
 from simrender.hardware.machine import Machine, MachineCard, check_processors, load_machine
+from simrender.policies.domain_frame import DomainPolicy
 from simrender.policies.frame import Frame, Policy
 from simrender.policies.islands import Fit, Layout, fit
 from simrender.policies.rank import PIXEL_BYTES, Rank
 from simrender.rays.integrators import PathTracing, RayCasting
 from simrender.rays.partition import Footprint, Partition
-from simrender.rays.trace import Progress, Trace
+from simrender.rays.trace import Progress
 from simrender.rays.workload import Workload, check_seed, load_workload
 from simrender.result import Result, breakdown, counts, links, owned_up, sampling_error, scope
 from simrender.timeline import Timeline
@@ -88,6 +89,8 @@ def simulate(
     if isinstance(workload, str):
         workload = load_workload(workload, given.get("workload", ()), cache)
     name, scheduler = _policy(policy, workload, given.get("policy", ()))
+    if isinstance(scheduler, DomainPolicy):
+        return _simulate_domains(machine, card, workload, name, scheduler, count, islands, seed, progress)
     if not isinstance(workload.integrator, PathTracing | RayCasting):
         other = workload.card.integrator.name
         hint = "; --set workload.integrator.name=path_tracing" if len(workload.scene.instance_object) else ""
@@ -146,11 +149,11 @@ def simulate(
 
     trace.complete()
     retired = np.concatenate(frame.retired)
-    _check_retired(trace, retired, frame.repeats)
+    check_retired(trace, retired, frame.repeats)
     _check_devices(frame, int(env.now))
     image = trace.image(np.unique(retired))
-    image_sha256 = _hash(image)
-    if image_sha256 != _hash(trace.reference):
+    image_sha256 = image_hash(image)
+    if image_sha256 != image_hash(trace.reference):
         raise InvariantError(f"{name} rendered another image than the reference renderer")
     if layout.size > 1:
         workload.crossings(seed, partition).save()
@@ -174,6 +177,60 @@ def simulate(
         spans=frame.timeline,
         loads={str(name): load for name, load in loads.items() if str(name) in carried},
     )
+
+
+def _simulate_domains(
+    machine: str | MachineCard,
+    card: MachineCard,
+    workload: Workload,
+    name: str,
+    policy: DomainPolicy,
+    count: int,
+    islands: Islands,
+    seed: int,
+    progress: Progress | None,
+) -> Result:
+    """Render one frame under a scheduler of domains."""
+    check_scene(workload, name)
+    noun = card.processor_noun
+    if not policy.in_situ and islands not in {"auto", count}:
+        raise UsageError(
+            f"--islands {islands}: under {name} every {noun} loads what it needs, so every {noun} is an island; "
+            "islands share data that stays in place, as with policy.data=in_situ"
+        )
+    workload.trace(seed, progress).complete()
+    domains = workload.domains()
+    try:
+        chosen = place(card, domains, policy, count, None if islands == "auto" else islands)
+    except ValueError as error:
+        raise UsageError(f"policy.cache={policy.cache}: {error}") from None
+    facts: dict[str, Any] = {
+        "machine": machine if isinstance(machine, str) else card.title,
+        "workload": workload.name,
+        "policy": name,
+        "seed": seed,
+        "processor": noun,
+        "gpus": count,
+        "islands": chosen.layout.islands,
+        "island_size": chosen.layout.size,
+        "unused_gpus": count - chosen.layout.ranks,
+        "feasible": chosen.feasible,
+        "memory": {
+            "needed_bytes": float(chosen.needed_bytes.max()),
+            "capacity_bytes": chosen.capacity_bytes,
+            "model_bytes": float(chosen.needed_bytes.max()),
+            "gpus_needed": chosen.gpus_needed,
+        },
+    }
+    if not chosen.feasible:
+        section = f"machine.{card.processor_section}."
+        deciding = [*card.processor.memory_quantities(section), *workload.card.quantities("workload.published.")]
+        cause = {
+            "modelled": [f"what each {noun} must hold"],
+            "left_out": [{"what": "the frame", "why": "it does not fit"}],
+        }
+        return Result(**facts, uncalibrated=owned_up(deciding), scope=cause)
+    return render(card, workload, policy, chosen, domains, seed, facts)
 
 
 def _overrides(
@@ -262,13 +319,6 @@ def _buffers(policy: Policy, workload: Workload, layout: Layout) -> tuple[list[d
     return cases, which
 
 
-def _check_retired(trace: Trace, retired: NDArray[np.int64], repeats: int) -> None:
-    times = np.bincount(retired, minlength=trace.rays)
-    if len(times) > trace.rays or not (times == repeats).all():
-        lost, repeated = int((times < repeats).sum()), int((times > repeats).sum())
-        raise InvariantError(f"of {trace.rays} rays {lost} were never retired and {repeated} more than once")
-
-
 def _check_devices(frame: Frame, end: int) -> None:
     """Check that no GPU did two things at once or ran past the end, and that the links carried what was sent."""
     log = frame.timeline
@@ -283,7 +333,3 @@ def _check_devices(frame: Frame, end: int) -> None:
         carried, expected = sum(network.carried_bytes.values()), network.sent_link_bytes
         if abs(carried - expected) > 1e-12 * expected:
             raise InvariantError(f"the links should have carried {expected} B and carried {carried} B")
-
-
-def _hash(image: NDArray[np.float32]) -> str:
-    return hashlib.sha256(repr(image.shape).encode() + np.ascontiguousarray(image, dtype="<f4").tobytes()).hexdigest()

@@ -8,10 +8,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from simrender.timeline import COPIES, KERNELS, Timeline
+from simrender.timeline import KINDS, Timeline
 
 SECOND = 10**12
-KINDS = KERNELS + COPIES
 TRACE, COPY = KINDS.index("trace"), KINDS.index("copy")
 
 SPANS = [

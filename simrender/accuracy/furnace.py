@@ -222,8 +222,23 @@ def _medium(size: int, samples: int, isovalues: tuple[float, ...] = (), *meshes:
     return image(scene, ASIDE, VolumePathTracing(FOREVER, roulette=0.0), size, samples), 1.0
 
 
+def _single_scattering(size: int, samples: int) -> Rendered:
+    # A cube seen along the way its light comes: the light is dimmed on the way in as on the way out.
+    albedo, intensity, opacity, side = 0.8, 40.0, 0.5, 2.0
+    transfer = TransferFunction(np.zeros(1), np.full((1, 3), albedo), np.array([opacity]))
+    fog = Volume(np.zeros((9, 9, 9), np.float32), (side / 8.0,) * 3, (-1.0,) * 3, transfer)
+    sun = PointLight((-1e5, 0.0, 0.0), (intensity,) * 3, falloff=False)
+    scene = Scene(
+        (), np.zeros(0, np.int32), np.zeros((0, 3, 4), np.float32), points=(sun,), environment=DARK, volume=fog
+    )
+    model = VolumePathTracing(bounces=1, shadow_probability=0.7, roulette=0.0)
+    seen = image(scene, camera((-5.0, 0.1, 0.2), (1.0, 0.0, 0.0), 1e-3), model, size, 4 * samples)
+    sigma = float(transfer.extinction[0])
+    return seen, albedo * intensity / (4.0 * math.pi) * -math.expm1(-2.0 * sigma * side) / 2.0
+
+
 def _marched(size: int, samples: int) -> Rendered:
-    scene = Scene((), np.zeros(0, np.int32), np.zeros((0, 3, 4)), environment=WHITE, volume=cloud(1.0))
+    scene = Scene((), np.zeros(0, np.int32), np.zeros((0, 3, 4), np.float32), environment=WHITE, volume=cloud(1.0))
     return image(scene, ASIDE, VolumeMarching(shading=False), size, samples), 1.0
 
 
@@ -247,8 +262,9 @@ FURNACES: dict[str, Callable[[int, int], Rendered]] = {
     "SpRay: floor under a point light": _spray,
     "SpRay: floor under a diffuse light": _spray_sky,
     "white cloud under a white sky": _medium,
-    "the same with isosurfaces": lambda n, s: _medium(n, s, (0.45, 0.55)),
+    "the same with an isosurface": lambda n, s: _medium(n, s, (0.7,)),
     "the same with a sphere in it": lambda n, s: _medium(n, s, (), ball()),
+    "fog in the sun, scattered once": _single_scattering,
     "white cloud, marched": _marched,
 }
 """What is rendered: functions of image size and samples that return an image and what it must be."""

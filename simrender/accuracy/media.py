@@ -85,7 +85,7 @@ def tracking(taus: Sequence[float], looseness: Sequence[float], budget: float = 
     ----------
     taus, looseness : floats
     budget : float
-        Look-ups that a case may take, about; it has 100 to 20,000 rays.
+        Look-ups that a case may take, about; it has 25 to 20,000 rays.
 
     """
     rows = []
@@ -95,7 +95,7 @@ def tracking(taus: Sequence[float], looseness: Sequence[float], budget: float = 
         mean = -math.expm1(-tau)
         variance = 2.0 * (mean - tau * math.exp(-tau)) - mean * mean if tau > 1e-3 else tau**3 / 3.0
         for loose in looseness:
-            n = int(min(max(budget / max(loose * min(tau, 1.0), 1e-9), 100.0), 20_000.0))
+            n = int(min(max(budget / max(loose * min(tau, 1.0), 1e-9), 25.0), 20_000.0))
             rng = generator(5)
             origin = np.column_stack([np.full(n, -1.0), rng.random((n, 2)) * SIDE])
             rays = bundle(origin, np.tile([1.0, 0.0, 0.0], (n, 1)))
@@ -191,7 +191,7 @@ class Chords:
 
 
 # Corners of the cells' elements: 0 .. 7 as a hexahedron in VTK's order, 8 the cell's centre.
-_CELLS = {
+_CELLS: dict[str, list[tuple[int, ...]]] = {
     "hexahedra": [(0, 1, 2, 3, 4, 5, 6, 7)],
     "wedges": [(0, 1, 2, 4, 5, 6), (0, 2, 3, 4, 6, 7)],
     "pyramids": [
@@ -253,9 +253,7 @@ def _chords(mesh: Elements, name: str, aim: str, origin: F64, target: F64, cells
     rgba = composite(found.rgba, found.entry, owner, part[found.row], n)
     error = np.where(loose, 0.0, np.abs(covered - chord)) / cells
     opacity = np.where(loose, 0.0, np.abs(rgba[:, 3] + np.expm1(-extinction * chord)))
-    return Chords(
-        name, aim, n, len(found.row), int((error > 1e-5).sum()), float(error.max()), float(opacity.max())
-    )
+    return Chords(name, aim, n, len(found.row), int((error > 1e-5).sum()), float(error.max()), float(opacity.max()))
 
 
 def _box(name: str, n: int, parts: int, extinction: float) -> Elements:

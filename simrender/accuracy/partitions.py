@@ -60,7 +60,9 @@ def path_rays(trace: Trace) -> Rays:
     return {name: np.concatenate([part[name] for part in parts]) for name in ("origin", "direction", "reach")}
 
 
-def aimed_rays(scene: Scene, domains: Domains, count: int, seed: int = 1) -> dict[str, Rays]:
+def aimed_rays(
+    scene: Scene, domains: Domains, count: int, seed: int = 1, welded: Welded | None = None
+) -> dict[str, Rays]:
     """Return rays that go where rounding decides, at most ``count`` of each kind, by name.
 
     ============= ====================================================================================================
@@ -73,13 +75,14 @@ def aimed_rays(scene: Scene, domains: Domains, count: int, seed: int = 1) -> dic
 
     Vertices are those that domains share, if there are such. Rays of the last three kinds start close to their vertex
     and end close behind it, and the surface around it is whole and not seen edge on. So each of them goes *through*
-    that surface: one that hits nothing has found a hole.
+    that surface: one that hits nothing has found a hole. Who asks for several partitions of a scene welds it once.
     """
     if domains.domain_of_triangle is None:
         raise SceneError("these domains do not say which triangles lie in them")
     rng = generator(seed)
     low, high = (corner.astype(np.float64) for corner in scene.bounds)
-    mesh = _Welded(scene, domains.domain_of_triangle)
+    mesh = welded or Welded(scene)
+    shared = mesh.shared(domains.domain_of_triangle)
     start = (low + (rng.random((count, 3)) * 3.0 - 1.0) * (high - low)).astype(np.float32)
     edge = mesh.faces[rng.integers(0, len(mesh.faces), count), :2]
     middle = mesh.vertices[edge].astype(np.float64).mean(axis=1).astype(np.float32)
@@ -89,18 +92,24 @@ def aimed_rays(scene: Scene, domains: Domains, count: int, seed: int = 1) -> dic
     signs = rng.choice([-1.0, 1.0], (count, 3))
     axes = np.eye(3)[rng.integers(0, 3, count)]
     return {
-        "vertices": bundle(start, mesh.vertices[mesh.pick(mesh.used, count, rng)].astype(np.float64) - start),
+        "vertices": bundle(start, mesh.vertices[mesh.pick(mesh.used, shared, count, rng)].astype(np.float64) - start),
         "edges": bundle(start, middle.astype(np.float64) - start),
-        "axis-parallel": mesh.through(axes * signs, rng, exact=True),
-        "diagonal": mesh.through(shapes * signs, rng, exact=True),
-        "faces": mesh.through(flat, rng, exact=False),
+        "axis-parallel": mesh.through(axes * signs, shared, rng, exact=True),
+        "diagonal": mesh.through(shapes * signs, shared, rng, exact=True),
+        "faces": mesh.through(flat, shared, rng, exact=False),
     }
 
 
-class _Welded:
-    """A scene's triangles with one vertex a place, and which vertices lie inside a surface."""
+class Welded:
+    """A scene's triangles with one vertex a place, and which vertices lie inside a surface.
 
-    def __init__(self, scene: Scene, domain: NDArray[np.int32]) -> None:
+    Parameters
+    ----------
+    scene : Scene
+
+    """
+
+    def __init__(self, scene: Scene) -> None:
         triangles = scene.triangles
         self.vertices, same = np.unique(triangles.vertices, axis=0, return_inverse=True)
         self.faces = same.reshape(-1)[triangles.faces]
@@ -121,25 +130,26 @@ class _Welded:
         closed = np.ones(count, np.bool_)
         closed[np.concatenate([open_ // count, open_ % count])] = False
         self.inner = np.flatnonzero(closed & (np.diff(self.begin) > 0))
-        self.shared = np.zeros(count, np.bool_)
-        first, last = np.full(count, np.iinfo(np.int32).max, np.int32), np.full(count, -1, np.int32)
+
+    def shared(self, domain: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Return which vertices have triangles of two domains around them."""
+        first, last = (np.full(len(self.vertices), n, np.int32) for n in (np.iinfo(np.int32).max, -1))
         for corner in self.faces.T:
             np.minimum.at(first, corner, domain)
             np.maximum.at(last, corner, domain)
-        self.shared = first < last
+        return np.less(first, last)
 
-    def pick(self, among: Ids, count: int, rng: np.random.Generator) -> Ids:
-        """Return vertices at random, those that domains share if there are such."""
-        shared = among[self.shared[among]]
-        pool = shared if len(shared) else among
+    def pick(self, among: Ids, first: NDArray[np.bool_], count: int, rng: np.random.Generator) -> Ids:
+        """Return vertices at random, those that come first if there are such."""
+        pool = among[first[among]] if first[among].any() else among
         return pool[rng.integers(0, len(pool), count)] if len(pool) else pool
 
-    def through(self, direction: F64, rng: np.random.Generator, *, exact: bool) -> Rays:
+    def through(self, direction: F64, first: NDArray[np.bool_], rng: np.random.Generator, *, exact: bool) -> Rays:
         """Return the rays of some directions, each through a vertex at random, that pass through its surface there.
 
         Of these keep, if wanted, those whose origins are exact.
         """
-        vertex = self.pick(self.inner, len(direction), rng)
+        vertex = self.pick(self.inner, first, len(direction), rng)
         direction = direction[: len(vertex)]
         faces = self.begin[vertex + 1] - self.begin[vertex]
         starts = np.concatenate([[0], np.cumsum(faces)])
@@ -254,13 +264,14 @@ def partitions(workload: Workload, cuts: Sequence[DomainsCard] = CUTS, count: in
     frame = Trace(trace.scene, trace.camera, (48, 36), 1, PathTracing(4, 4, 0.3), trace.seed, workload.cache)
     world = SurfaceWorld(trace.scene, PathTracing())
     loose = {"paths": path_rays(frame), "random": random_rays(trace.scene, count)}
+    welded = Welded(trace.scene)
     given = [] if workload.card.domains is None else [workload.card.domains]
     rows = []
     for cut in (*given, *cuts):
         domains = workload.domains(cut)
         if domains.count > 99:
             continue
-        for aim, rays in (loose | aimed_rays(trace.scene, domains, count // 4)).items():
+        for aim, rays in (loose | aimed_rays(trace.scene, domains, count // 4, welded=welded)).items():
             label = {"scene": workload.name, "cut": cut.method, "domains": domains.count, "aim": aim}
             rows.append(label | asdict(compare(world, domains, rays)))
     return rows

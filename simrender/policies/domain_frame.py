@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Generator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 import simpy
@@ -25,6 +25,7 @@ Ids = NDArray[np.int64]
 Steps = Generator[simpy.Event, Any, Any]
 
 
+@runtime_checkable
 class DomainPolicy(Protocol):
     """A scheduler that decides which rays meet which domain when: a frozen dataclass, its fields its parameters."""
 
@@ -78,13 +79,18 @@ class Counters:
     critical_tests: int = 0
 
 
+EXPLAINED = 12
+"""Steps of which the whole state of the queues is kept, for `--explain schedule`."""
+
+
 @dataclass(frozen=True)
 class Event:
-    """One visit of the schedule, as `--explain schedule` prints it.
+    """One visit of the schedule.
 
     Attributes
     ----------
     rank, step, domain : int
+        Steps count a rank's visits from 0 or, where ranks schedule together, their rounds.
     loaded : bool
     radiance_tests, shadow_tests : int
 
@@ -96,6 +102,26 @@ class Event:
     loaded: bool
     radiance_tests: int
     shadow_tests: int
+
+
+@dataclass(frozen=True, eq=False)
+class Moment:
+    """The queues before a step, as figure 2 of SpRay draws them.
+
+    Attributes
+    ----------
+    rank : int or None
+        Whose queues; None for those of all ranks together.
+    waiting : int64 array (domains,)
+        Rays in each queue.
+    scheduled : tuple of int
+        The domains that are processed next.
+
+    """
+
+    rank: int | None
+    waiting: NDArray[np.int64]
+    scheduled: tuple[int, ...]
 
 
 @dataclass
@@ -112,6 +138,11 @@ class DomainFrame:
     owner : int64 array (domains,) or None
         The rank that holds each domain; None where every rank loads what it needs.
     rank_of_pixel : int64 array (pixels,)
+        Negative where another island renders it.
+    caches : list of DomainCache
+        Of each rank.
+    first_rank : int
+        The processor of the first rank; the others follow it.
     weight : float
         Published rays for which a traced ray stands.
     published : (width, height)
@@ -130,8 +161,10 @@ class DomainFrame:
     caches: list[DomainCache]
     weight: float
     published: tuple[int, int]
+    first_rank: int = 0
     counters: Counters = field(default_factory=Counters)
     events: list[Event] = field(default_factory=list)
+    moments: list[Moment] = field(default_factory=list)
     retired: list[Ids] = field(default_factory=list)
     outbox: dict[tuple[int, int, int], tuple[Ids, NDArray[np.int16]]] = field(default_factory=dict)
     gathered: dict[int, list[NDArray[np.int64]]] = field(default_factory=dict)

@@ -11,7 +11,7 @@ import simpy
 from numpy.typing import NDArray
 
 from simrender.errors import InvariantError
-from simrender.policies.domain_frame import DomainFrame, Event, Steps
+from simrender.policies.domain_frame import EXPLAINED, DomainFrame, Event, Moment, Steps
 from simrender.policies.queues import DomainQueues
 from simrender.timeline import COPIES, KERNELS, PHASES
 
@@ -46,7 +46,8 @@ class DomainRank:
 
     def __init__(self, frame: DomainFrame, index: int) -> None:
         self._frame, self.index, self.ranks = frame, index, frame.ranks
-        self._processor = frame.machine.processor(index)
+        self.device = frame.first_rank + index
+        self._processor = frame.machine.processor(self.device)
         self.queues = DomainQueues(frame.domains.count)
         self.cache = frame.caches[index]
         self.owned = np.arange(frame.domains.count)
@@ -104,7 +105,6 @@ class DomainRank:
         """Have a domain in memory: take it from the cache, or read, parse and build it."""
         frame = self._frame
         frame.counters.visits += 1
-        self.step += 1
         self._loaded = False
         if frame.owner is not None or self.cache.touch(domain):
             return
@@ -112,10 +112,10 @@ class DomainRank:
         self._loaded = True
         begin = int(frame.env.now)
         nbytes, primitives = float(frame.domains.bytes[domain]), float(frame.domains.primitives[domain])
-        yield from frame.machine.load(self.index, nbytes, primitives)
+        yield from frame.machine.load(self.device, nbytes, primitives)
         frame.counters.loads += 1
         frame.counters.loaded_bytes += nbytes
-        frame.timeline.add(self.index, LOAD, begin, int(frame.env.now), nbytes, 0.0)
+        frame.timeline.add(self.device, LOAD, begin, int(frame.env.now), nbytes, 0.0)
 
     def trace(self, domain: int, rays: Ids) -> Steps:
         """Query a domain for the hits of radiance rays and the occlusion of shadow rays."""
@@ -142,7 +142,12 @@ class DomainRank:
             seconds *= cores / min(frame.policy.threads, cores)
         begin, end = self._processor.run(seconds, int(frame.env.now))
         yield frame.env.timeout(end - int(frame.env.now))
-        frame.timeline.add(self.index, TRACE, begin, end, 0.0, (coherent + incoherent) * weight)
+        frame.timeline.add(self.device, TRACE, begin, end, 0.0, (coherent + incoherent) * weight)
+
+    def explain(self, waiting: NDArray[np.int64], scheduled: tuple[int, ...], *, together: bool = False) -> None:
+        """Keep the state of the queues before one of the first steps."""
+        if self.step < EXPLAINED and (self.index == 0 or not together):
+            self._frame.moments.append(Moment(None if together else self.index, waiting.copy(), scheduled))
 
     def begin_visit(self) -> None:
         """Begin to count a visit's tests."""
@@ -150,8 +155,11 @@ class DomainRank:
 
     def end_visit(self, domain: int) -> None:
         """Log a visit."""
-        frame = self._frame
-        frame.events.append(Event(self.index, self.step, domain, self._loaded, *self._tests))
+        self._frame.events.append(Event(self.index, self.step, domain, self._loaded, *self._tests))
+
+    def next_step(self) -> None:
+        """Go on to the next step."""
+        self.step += 1
 
     # -- other ranks ----------------------------------------------------------------------------------------------
 
@@ -165,7 +173,7 @@ class DomainRank:
         frame.gathered.setdefault(call, []).append(counts.copy())
         begin = int(frame.env.now)
         yield self.comm.allreduce(float(COUNT_BYTES * len(counts)))
-        frame.timeline.add(self.index, SYNC, begin, int(frame.env.now), 0.0, 0.0)
+        frame.timeline.add(self.device, SYNC, begin, int(frame.env.now), 0.0, 0.0)
         return np.sum(frame.gathered[call], axis=0)
 
     def send(self, target: int, rays: Ids, tag: int, nbytes: float) -> simpy.Event:
@@ -180,29 +188,29 @@ class DomainRank:
 
     def receive(self, rays: int) -> Steps:
         """Wait for messages until so many rays have come; return them."""
-        frame = self._frame
+        frame, begin = self._frame, int(self._frame.env.now)
         got = [np.zeros(0, np.int64)]
         while sum(map(len, got)) < rays:
             assert self.comm is not None  # noqa: S101 - there is another rank
             message = yield self.comm.irecv()
             got.append(frame.outbox.pop((message.source, self.index, message.tag))[0])
         found = np.concatenate(got)
+        frame.timeline.add(self.device, COPY, begin, int(frame.env.now), 0.0, len(found) * frame.weight)
         if len(found) != rays:
             raise InvariantError(f"rank {self.index} got {len(found)} rays and expected {rays}")
         return found
 
     def barrier(self) -> Steps:
-        """Wait for all ranks."""
+        """Wait for all ranks; that is time lost to imbalance, and counts as waiting."""
         if self.comm is not None:
-            begin = int(self._frame.env.now)
             yield self.comm.barrier()
-            self._frame.timeline.add(self.index, SYNC, begin, int(self._frame.env.now), 0.0, 0.0)
 
     def merge_frame(self) -> Steps:
         """Add up the images of all ranks on rank 0."""
         frame = self._frame
         if self.comm is None:
             return
+        yield from self.barrier()
         begin = int(frame.env.now)
         yield self.comm.reduce(float(PIXEL_BYTES * frame.published[0] * frame.published[1]))
-        frame.timeline.add(self.index, MERGE, begin, int(frame.env.now), 0.0, 0.0)
+        frame.timeline.add(self.device, MERGE, begin, int(frame.env.now), 0.0, 0.0)

@@ -1,7 +1,8 @@
 """LoadAnyOnce: always process the domain for which most rays wait.
 
 Pharr et al., "Rendering complex scenes with memory-coherent ray tracing" (1997), out of core; Navratil et al.,
-"Exploring the spectrum of dynamic scheduling algorithms for scalable distributed-memory ray tracing" (2014), over ranks;
+"Exploring the spectrum of dynamic scheduling algorithms for scalable distributed-memory ray tracing" (2014), over
+ranks;
 both as Park, Fussell and Navratil, "SpRay: speculative ray scheduling for large data visualization" (2018), section 3
 and listing 1, have them for their baselines.
 """
@@ -65,7 +66,9 @@ class LoadAnyOnce:
         me.enqueue(me.camera_rays())
         if self.data == "out_of_core":
             while (domain := self.choose(me)) is not None:
+                me.explain(me.queues.counts, (domain,))
                 yield from self.visit(me, domain)
+                me.next_step()
         else:
             yield from self.rounds(me)
         yield from me.merge_frame()
@@ -97,11 +100,13 @@ class LoadAnyOnce:
             if not waiting.any():
                 return
             schedule = self.schedule(me, waiting)
+            me.explain(waiting, tuple(schedule.values()), together=True)
             yield from self.exchange(me, schedule, waiting)
             domain = schedule.get(me.index)
             if domain is not None:
                 yield from self.visit(me, domain)
             yield from me.barrier()
+            me.next_step()
 
     def schedule(self, me: DomainRank, waiting: NDArray[np.int64]) -> dict[int, int]:
         """Return the domain of each rank that has one this round: the same on all ranks."""
@@ -123,5 +128,5 @@ class LoadAnyOnce:
         if me.index in schedule:
             domain = schedule[me.index]
             me.enqueue((yield from me.receive(int(waiting[domain] - me.queues.counts[domain]))))
-        for event in leaving:
+        for event in leaving:  # noqa: UP028 - SimPy's events are no generators
             yield event

@@ -32,7 +32,7 @@ FARTHEST = 100.0
 """Distance of a surface, in sizes of its scene, beyond which more than one ray in a hundred goes astray."""
 
 FARTHEST_VOLUME = 1000.0
-"""The same of a volume: points are off by a twentieth of a voxel where there are a thousand along an axis."""
+"""The same of a volume: points are off by a tenth of a voxel where there are a thousand along an axis."""
 
 SMALLEST = 1e-30
 """Size of a scene below which coordinates lose digits, because float32 has no smaller exponents."""

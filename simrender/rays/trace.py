@@ -31,6 +31,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import warnings
 from collections.abc import Callable
 from functools import cached_property, partial
 from pathlib import Path
@@ -39,10 +40,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from simrender.errors import SceneWarning
 from simrender.rays import embree
 from simrender.rays.integrators import Integrator
 from simrender.rays.kinds import CAMERA, KINDS
 from simrender.rays.memory import check_memory
+from simrender.rays.precision import out_of_range
 from simrender.rays.scene import Scene
 from simrender.rays.store import NoStore, Store, code_version
 
@@ -119,6 +122,8 @@ class Trace:
         like: Trace | None = None,
     ) -> None:
         self._like = like
+        if like is None and (message := out_of_range(scene, camera[0])):
+            warnings.warn(message, SceneWarning, stacklevel=2)
         factor: float = _handy(scene) if like is None else like.factor
         traced: Scene = (scene if factor == 1.0 else scene.scaled(factor)) if like is None else like.scene
         self.factor, self.scene = factor, traced

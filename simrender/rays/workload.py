@@ -25,6 +25,7 @@ from simrender.rays.workload_card import DomainsCard, WorkloadCard
 if TYPE_CHECKING:
     from simrender.rays.crossings import Crossings
     from simrender.rays.domains import Domains
+    from simrender.rays.visits import Visits
 
 
 @dataclass(eq=False)
@@ -59,6 +60,7 @@ class Workload:
     _crossings: dict[tuple[int, str], Crossings] = field(default_factory=dict)
     _partitions: dict[Any, Partition] = field(default_factory=dict)
     _domains: dict[str, Domains] = field(default_factory=dict)
+    _visits: dict[tuple[str, str], Visits] = field(default_factory=dict)
     _like: Trace | None = None
 
     @property
@@ -212,6 +214,15 @@ class Workload:
 
             self._crossings[key] = Crossings(self.trace(seed), domains)
         return self._crossings[key]
+
+    def visits(self, crossings: Crossings) -> Visits:
+        """Return the domains that each ray of a complete trace visits without speculation."""
+        from simrender.rays.visits import visits
+
+        key = (crossings.trace.key, crossings.domains.key)
+        if key not in self._visits:
+            self._visits[key] = visits(crossings)
+        return self._visits[key]
 
     def partition(self, domains: int, footprint: Footprint, method: Method, split_share: float) -> Partition:
         """Return the scene dealt to so many domains, with weights for a machine's footprint."""

@@ -13,7 +13,14 @@ from simrender.units import format_bytes, format_count, format_seconds
 if TYPE_CHECKING:
     from simrender.result import Result
 
-_BARS = {"trace": ("█", "green"), "shade": ("▓", "dark_green"), "copy": ("▒", "blue"), "wait": ("░", "bright_black")}
+_BARS = {
+    "load": ("▚", "yellow"),
+    "sync": ("╱", "magenta"),
+    "trace": ("█", "green"),
+    "shade": ("▓", "dark_green"),
+    "copy": ("▒", "blue"),
+    "wait": ("░", "bright_black"),
+}
 """Told apart without colours too."""
 
 _BAR = 48
@@ -114,6 +121,14 @@ def _infeasible(result: Result) -> list[Any]:
     islands, many = ("s" if n != 1 else "" for n in (result.islands, result.island_size))
     size = f"{result.islands} island{islands} of {result.island_size} {noun}{many}"
     why = "one part of the model cannot be split" if result.island_size > 1 else f"every {noun} would hold all of it"
+    if "peak_rays_bytes" in m and m["model_bytes"] <= m["capacity_bytes"]:
+        return [
+            Text(f"{result.workload} does not fit on {result.machine} under {result.policy}", style="bold red"),
+            Text(
+                f"The data take {format_bytes(m['model_bytes'])} of {capacity} on the fullest {noun}, and the rays that "
+                f"are in flight there another {format_bytes(m['peak_rays_bytes'])}."
+            ),
+        ]
     lines = [
         Text(f"{result.workload} does not fit on {result.machine} under {result.policy}", style="bold red"),
         Text(f"In {size}, the fullest {noun} would need {need} and has {capacity}."),

@@ -139,7 +139,7 @@ def plot_heat(values: F64, title: str, label: str) -> Figure:
     from matplotlib.figure import Figure
 
     height, width = values.shape
-    figure = Figure(figsize=(8.0, max(2.2, 6.6 * height / width + 1.0)), layout="constrained")
+    figure = Figure(figsize=(8.0, min(max(2.2, 6.6 * height / width + 1.0), 16.0)), layout="constrained")
     axes = figure.add_subplot()
     drawn = axes.imshow(values, cmap="inferno", interpolation="nearest", vmin=0.0)
     axes.set_title(title, loc="left", fontsize=11)
