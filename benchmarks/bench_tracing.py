@@ -8,8 +8,9 @@ of embreex, on the same rays. Three kinds of `follow`, from what embreex itself 
 - *spawned*: the shade step of the workload, with the columns of all rays that these rays spawn.
 
 Shading is work that embreex is not asked for, so only the first is a measure of the tables. Both sides take turns, so
-that whatever else runs on the machine slows both down; a ratio is the median over the turns. With benchmarks disabled
-everything runs once at a small size and only counts are checked.
+that whatever else runs on the machine slows both down; a ratio is the median over the turns. Columns are let go after
+each turn, so most turns find their memory already mapped; what it costs to map it shows in the whole frame. With
+benchmarks disabled everything runs once at a small size and only counts are checked.
 """
 
 from __future__ import annotations
@@ -114,7 +115,7 @@ def test_tables_against_raw_embreex(benchmark, tmp_path, name, generation):
     benchmark.pedantic(works[-1], rounds=1)
     if benchmark.enabled:
         assert min(ratios["hits"][0], ratios["shaded"][0]) >= 0.75
-        assert ratios["spawned"][0] >= 0.5
+        assert ratios["spawned"][0] >= (0.65 if generation else 0.5)
 
 
 @pytest.mark.parametrize("name", SCENES)
@@ -148,4 +149,4 @@ def test_a_whole_frame(benchmark, tmp_path, name):
     print(f"{disk:.2f} onto the disk")
     benchmark.pedantic(frame, rounds=1)
     if benchmark.enabled:
-        assert memory >= 0.6
+        assert memory >= 0.5

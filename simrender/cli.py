@@ -40,8 +40,8 @@ app = App(
 def _whole(_type: Any, tokens: Sequence[Token]) -> int:
     """Read a whole number; cyclopts itself would take 2.5 for 2."""
     keyword, text = tokens[0].keyword, tokens[0].value
-    if not re.fullmatch(r"[-+]?[0-9]{1,18}", text):
-        raise UsageError(f"{keyword} {text}: expected a whole number{' of up to 18 digits' if text.isdigit() else ''}")
+    if not re.fullmatch(r"[-+]?[0-9]{1,20}", text):
+        raise UsageError(f"{keyword} {text}: expected a whole number{' of up to 20 digits' if text.isdigit() else ''}")
     return int(text)
 
 
@@ -190,16 +190,19 @@ def trace(
         check_target("--json", Path(json), (".json",))
     if show and not image:
         raise UsageError(f"--show {show} says what --image shows; give --image FILE.png too")
+    if ranks is not None and ranks < 1:
+        raise UsageError(f"--ranks {ranks}: expected a number of ranks from 1 on")
     if ranks is not None and show != "domains":
         raise UsageError(f"--ranks {ranks} goes with --show domains")
     if replicas is not None and not 2 <= replicas <= MOST_REPLICAS:
         raise UsageError(f"--replicas {replicas}: expected 2 to {MOST_REPLICAS}")
-    overrides = list(split_assignments(set_, ("workload",))["workload"])
+    overrides = []
     if resolution is not None:
         width, height = _resolution(resolution)
         overrides.append(f"traced.resolution={width}x{height}")
         if Path(workload).suffix.lower() not in CARD_ENDINGS and Path(workload).is_file():
             overrides.append(f"published.resolution={width}x{height}")  # a bare file publishes nothing
+    overrides += split_assignments(set_, ("workload",))["workload"]
     begin = time.perf_counter()
     loaded = load_workload(workload, overrides, cache)
     if frame is not None:
@@ -208,11 +211,11 @@ def trace(
             raise UsageError(f"--frame {frame}: expected NUMBER/COUNT such as 0/8, the first of eight")
         loaded = loaded.frame(int(match[1]), int(match[2]))
     cut = _domains_card(loaded.card.domains, partition, domains)
-    rays = loaded.trace(seed)
+    pieces, rays = loaded.domains(cut), loaded.trace(seed)
     with _Progress() as progress:
         rays.progress = progress
         rays.complete()
-    crossings = loaded.domain_crossings(seed, loaded.domains(cut))
+    crossings = loaded.domain_crossings(seed, pieces)
     crossings.table(0)
     crossings.save()
     estimates, picture = _replicate(loaded, crossings, seed, replicas or (4 if show == "error" else 0))
@@ -233,7 +236,7 @@ def trace(
             write_image(image, rays.image())
         else:
             _write_picture(image, show, loaded.name, rays, crossings, ranks, picture)
-        _note(f"wrote {image} ({rays.size[0]}x{rays.size[1]})")
+        _note(f"wrote {image}" + (f" ({rays.size[0]}x{rays.size[1]})" if show in {None, "domains"} else ""))
     _note(f"done in {time.perf_counter() - begin:.2f} s")
 
 
@@ -287,6 +290,9 @@ def _replicate(
         counted.append(replica_counts(workload, rays, workload.domain_crossings(s, crossings.domains)))
         images.append(rays.image())
     names = list(counted[0])
+    if replicas > 1 and all((other == images[0]).all() for other in images[1:]):
+        warnings.warn("nothing in this image is random, so replicas tell nothing of its error", stacklevel=2)
+        return {}, estimate(images)
     return {name: estimate([counts[name] for counts in counted]) for name in names}, estimate(images)
 
 
@@ -406,6 +412,53 @@ def run(
         _note("nothing was rendered, so no picture and no timeline were written")
     _note(f"simulated in {seconds:.2f} s")
     return 0 if result.feasible else 3
+
+
+@app.command
+def compare(
+    program: Literal["spray"],  # noqa: ARG001 - the only one so far
+    runs: Path,
+    scene: Path,
+    /,
+    *,
+    json: Annotated[str | None, Parameter(negative="")] = None,
+    cache: Flag = None,
+) -> None:
+    """Compare with what an independent program counted: simulate each of its runs, and tell the difference.
+
+    Parameters
+    ----------
+    program
+        spray, the program of the SpRay paper.
+    runs
+        A table of its runs (.csv).
+    scene
+        The scene that it rendered (.spray).
+    json
+        Write the comparison as JSON to a file, or to stdout (-).
+    cache
+        Folder of the trace cache.
+
+    """
+    import dataclasses
+
+    from simrender.accuracy.spray import compare as compared
+    from simrender.report.comparison import describe_comparison
+    from simrender.report.files import check_target, write_json
+
+    if json is not None and json != "-":
+        check_target("--json", Path(json), (".json",))
+    begin = time.perf_counter()
+    rows = list(compared(runs, scene, cache=cache))
+    value = [dataclasses.asdict(row) for row in rows]
+    if json == "-":
+        _print_json(value)
+    else:
+        _console().print(describe_comparison(rows))
+        if json:
+            write_json(Path(json), value)
+            _note(f"wrote {json}")
+    _note(f"compared in {time.perf_counter() - begin:.2f} s")
 
 
 @app.command

@@ -14,7 +14,7 @@ from simrender.clock import to_seconds
 from simrender.errors import InvariantError, UsageError
 from simrender.hardware.cache import DomainCache
 from simrender.hardware.machine import Machine, MachineCard
-from simrender.policies.domain_frame import DomainFrame, DomainPolicy, cache_capacity, stripes
+from simrender.policies.domain_frame import DomainFrame, DomainPolicy, Event, cache_capacity, stripes
 from simrender.policies.domain_rank import DomainRank
 from simrender.policies.islands import Fit, fit
 from simrender.rays.domains import Domains, morton_ranks
@@ -34,12 +34,32 @@ def place(card: MachineCard, domains: Domains, policy: DomainPolicy, ranks: int,
 
     def need(count: int, size: int) -> NDArray[np.float64]:
         if policy.in_situ:
-            held = np.bincount(morton_ranks(domains.low, domains.high, size), sizes, minlength=size)
-            return np.tile(held, count)
+            given = policy.owners is not None and size == ranks // count
+            owner = owners(policy, domains, size) if given else morton_ranks(domains.low, domains.high, size)
+            return np.tile(np.bincount(owner, sizes, minlength=size), count)
         # A slot of the cache is as large as the largest domain.
         return np.full(count * size, cache_capacity(policy.cache, domains.count) * float(sizes.max()))
 
     return fit(ranks, islands, need, capacity, replicated=not policy.in_situ)
+
+
+def owners(policy: DomainPolicy, domains: Domains, ranks: int) -> NDArray[np.int64]:
+    """Return the rank that holds each domain in situ.
+
+    Raises
+    ------
+    UsageError
+        If the policy gives another number of owners than there are domains, or one that is no rank.
+
+    """
+    if policy.owners is None:
+        return morton_ranks(domains.low, domains.high, ranks).astype(np.int64)
+    given = np.array(policy.owners, np.int64)
+    if len(given) != domains.count:
+        raise UsageError(f"policy.owners has {len(given)} entries, and there are {domains.count} domains")
+    if given.min() < 0 or given.max() >= ranks:
+        raise UsageError(f"policy.owners gives domains to ranks {given.min()} to {given.max()}, and there are {ranks}")
+    return given
 
 
 def loaded_bytes(card: MachineCard, domains: Domains) -> NDArray[np.float64]:
@@ -83,6 +103,7 @@ def render(
     weight = frames[0].weight
     counted = [dataclasses.asdict(f.counters) for f in frames]
     counters = {name: sum(c[name] for c in counted) for name in counted[0]}
+    counters["critical_tests"] = _critical_tests([event for f in frames for event in f.events])
     ray_bytes = getattr(policy, "ray_bytes", RAY_BYTES)
     peak = max(max(f.peak_rays) for f in frames) * weight * ray_bytes
     memory = facts["memory"] | {"peak_rays_bytes": peak, "needed_bytes": facts["memory"]["needed_bytes"] + peak}
@@ -139,7 +160,7 @@ def _frame(
     return DomainFrame(
         env, devices, crossings, workload.visits(crossings), policy, timeline,
         devices.communicator(list(range(first, first + size))) if size > 1 else None,
-        morton_ranks(domains.low, domains.high, size).astype(np.int64) if policy.in_situ else None,
+        owners(policy, domains, size) if policy.in_situ else None,
         rank_of_pixel, [DomainCache(sizes, capacity) for _ in range(size)],
         workload.weight * workload.repeats, workload.card.published.resolution, first,
     )  # fmt: skip
@@ -163,6 +184,17 @@ def image_hash(image: NDArray[np.float32]) -> str:
     """Return the hash of an image: equal for images that are equal to the bit."""
     pixels = np.ascontiguousarray(image, dtype="<f4").tobytes()
     return hashlib.sha256(repr(image.shape).encode() + pixels).hexdigest()
+
+
+def _critical_tests(events: list[Event]) -> int:
+    """Return the sum over the steps of the busiest rank's tests."""
+    of_rank: dict[tuple[int, int], int] = {}
+    for e in events:
+        of_rank[e.step, e.rank] = of_rank.get((e.step, e.rank), 0) + e.radiance_tests + e.shadow_tests
+    busiest: dict[int, int] = {}
+    for (step, _), tests in of_rank.items():
+        busiest[step] = max(busiest.get(step, 0), tests)
+    return sum(busiest.values())
 
 
 def _scope(devices: Machine, policy: DomainPolicy) -> dict[str, Any]:

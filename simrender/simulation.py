@@ -93,7 +93,7 @@ def simulate(
         return _simulate_domains(machine, card, workload, name, scheduler, count, islands, seed, progress)
     if not isinstance(workload.integrator, PathTracing | RayCasting):
         other = workload.card.integrator.name
-        hint = "; --set workload.integrator.name=path_tracing" if len(workload.scene.instance_object) else ""
+        hint = "; --set workload.integrator=path_tracing" if len(workload.scene.instance_object) else ""
         raise UsageError(
             f"{name} moves the rays of path_tracing, and the integrator of {workload.name} is {other}{hint}"
         )

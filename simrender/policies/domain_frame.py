@@ -41,6 +41,10 @@ class DomainPolicy(Protocol):
     def threads(self) -> int | None:
         """How many of a processor's cores trace; all by default."""
 
+    @property
+    def owners(self) -> tuple[int, ...] | None:
+        """The rank of each domain in situ; blocks in Morton order by default."""
+
     def rank(self, me: DomainRank) -> Steps:
         """Render the frame on one rank."""
 
@@ -166,8 +170,10 @@ class DomainFrame:
     events: list[Event] = field(default_factory=list)
     moments: list[Moment] = field(default_factory=list)
     retired: list[Ids] = field(default_factory=list)
-    outbox: dict[tuple[int, int, int], tuple[Ids, NDArray[np.int16]]] = field(default_factory=dict)
+    outbox: dict[tuple[int, int, int], Ids] = field(default_factory=dict)
     gathered: dict[int, list[NDArray[np.int64]]] = field(default_factory=dict)
+    told: dict[int, dict[int, Any]] = field(default_factory=dict)
+    shared: dict[tuple[int, int], tuple[Any, int]] = field(default_factory=dict)
     tests_of_step: dict[int, dict[int, int]] = field(default_factory=dict)
     peak_rays: list[int] = field(default_factory=list)
 

@@ -6,6 +6,9 @@ is read, parsed and built into a hierarchy, rays are traced on the rank's proces
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
+
 import numpy as np
 import simpy
 from numpy.typing import NDArray
@@ -16,6 +19,7 @@ from simrender.policies.queues import DomainQueues
 from simrender.timeline import COPIES, KERNELS, PHASES
 
 Ids = NDArray[np.int64]
+T = TypeVar("T")
 
 TRACE = KERNELS.index("trace")
 MERGE = len(KERNELS) + COPIES.index("merge")
@@ -24,6 +28,12 @@ LOAD, SYNC = (len(KERNELS) + len(COPIES) + PHASES.index(name) for name in ("load
 
 PIXEL_BYTES = 16
 """A pixel of the image that ranks add up: four floats, as SpRay's program sends them."""
+
+INT_BYTES = 4
+"""An integer of the MPI programs."""
+
+GATHER_TAG = -1
+"""Of messages that belong to a gather; rays have tags from 0 on."""
 
 COUNT_BYTES = 8
 """A count of rays that ranks add up."""
@@ -58,15 +68,17 @@ class DomainRank:
         if frame.owner is not None:
             self.owned_by_rank = frame.owned_by_rank
         self.step = 0
-        self._collectives = 0
+        self._collectives = self._asked = 0
 
     # -- rays -----------------------------------------------------------------------------------------------------
 
-    def camera_rays(self) -> Ids:
-        """Return the camera rays of this rank's pixels that enter a domain; the others are done."""
+    def camera_rays(self, *, all_of_them: bool = False) -> Ids:
+        """Return the camera rays of this rank's pixels that enter a domain, or all; the others are done."""
         frame = self._frame
         count = frame.trace.first[1]
         mine = np.flatnonzero(frame.rank_of_pixel[frame.trace.column("pixel")[:count]] == self.index)
+        if all_of_them:
+            return mine
         meets = frame.visits.first[mine + 1] > frame.visits.first[mine]
         self.retire(mine[~meets])
         return mine[meets]
@@ -134,8 +146,23 @@ class DomainRank:
 
     def compute(self, domain: int, coherent: float, incoherent: float) -> Steps:
         """Run a trace kernel over a domain; rays are traced ones."""
+        yield from self._run(float(self._frame.domains.primitives[domain]), coherent, incoherent)
+
+    def trace_all(self, rays: Ids) -> Steps:
+        """Query all that this rank holds, as one hierarchy, for rays, whatever they enter."""
         frame = self._frame
-        weight, primitives = frame.weight, float(frame.domains.primitives[domain])
+        primitives = float(frame.domains.primitives[self.owned].sum())
+        frame.peak_rays[self.index] = max(frame.peak_rays[self.index], len(rays))
+        if len(rays) == 0 or primitives == 0.0:
+            return
+        shadow, coherent = int(frame.shadow[rays].sum()), int(frame.coherent[rays].sum())
+        yield from self._run(primitives, coherent, len(rays) - coherent)
+        frame.counters.shadow_tests += shadow
+        frame.counters.radiance_tests += len(rays) - shadow
+
+    def _run(self, primitives: float, coherent: float, incoherent: float) -> Steps:
+        frame = self._frame
+        weight = frame.weight
         seconds = self._processor.trace_seconds(coherent * weight, incoherent * weight, primitives)
         cores = getattr(self._processor.card, "cores", None)
         if frame.policy.threads and cores:
@@ -157,6 +184,11 @@ class DomainRank:
         """Log a visit."""
         self._frame.events.append(Event(self.index, self.step, domain, self._loaded, *self._tests))
 
+    def count_step(self) -> None:
+        """Count a step that all ranks take together."""
+        if self.index == 0:
+            self._frame.counters.steps += 1
+
     def next_step(self) -> None:
         """Go on to the next step."""
         self.step += 1
@@ -168,37 +200,109 @@ class DomainRank:
         frame = self._frame
         if self.comm is None:
             return counts
-        call = self._collectives
+        call, self._asked = self._collectives, 0
         self._collectives += 1
         frame.gathered.setdefault(call, []).append(counts.copy())
         begin = int(frame.env.now)
         yield self.comm.allreduce(float(COUNT_BYTES * len(counts)))
         frame.timeline.add(self.device, SYNC, begin, int(frame.env.now), 0.0, 0.0)
-        return np.sum(frame.gathered[call], axis=0)
+        return self.alike(lambda: np.sum(frame.gathered.pop(call), axis=0))
+
+    def alike(self, compute: Callable[[], T]) -> T:
+        """Return what every rank would compute alike since the last collective, computed by the first that asks."""
+        shared, key = self._frame.shared, (self._collectives, self._asked)
+        self._asked += 1
+        if key not in shared:
+            shared[key] = compute(), 0
+        value, asked = shared[key]
+        shared[key] = value, asked + 1
+        if asked + 1 == self.ranks:
+            del shared[key]
+        return cast("T", value)
 
     def send(self, target: int, rays: Ids, tag: int, nbytes: float) -> simpy.Event:
         """Send rays to another rank; done when they have left."""
         frame = self._frame
         assert self.comm is not None  # noqa: S101 - there is another rank
-        frame.outbox[self.index, target, tag] = rays, frame.visits.domain[frame.position[rays]]
+        frame.outbox[self.index, target, tag] = rays
         frame.counters.messages += 1
         frame.counters.sent_rays += len(rays)
         frame.counters.sent_bytes += nbytes * frame.weight
         return self.comm.isend(target, nbytes * frame.weight, tag)
 
-    def receive(self, rays: int) -> Steps:
-        """Wait for messages until so many rays have come; return them."""
+    def receive(self, rays: int, tag: int | None = None) -> Steps:
+        """Wait for messages, those with a tag if one is given, until so many rays have come; return them."""
         frame, begin = self._frame, int(self._frame.env.now)
         got = [np.zeros(0, np.int64)]
         while sum(map(len, got)) < rays:
-            assert self.comm is not None  # noqa: S101 - there is another rank
-            message = yield self.comm.irecv()
-            got.append(frame.outbox.pop((message.source, self.index, message.tag))[0])
+            got.append((yield from self.next_message(tag))[2])
         found = np.concatenate(got)
         frame.timeline.add(self.device, COPY, begin, int(frame.env.now), 0.0, len(found) * frame.weight)
         if len(found) != rays:
             raise InvariantError(f"rank {self.index} got {len(found)} rays and expected {rays}")
         return found
+
+    def next_message(self, tag: int | None = None) -> Steps:
+        """Wait for a message, with a tag if one is given; return (source, tag, rays)."""
+        assert self.comm is not None  # noqa: S101 - there is another rank
+        message = yield self.comm.irecv(tag=tag)
+        return message.source, message.tag, self._frame.outbox.pop((message.source, self.index, message.tag))
+
+    def gather(self, value: object, nbytes: float) -> Steps:
+        """Give rank 0 what all ranks have to say, a list by rank: first how long it is, then that; None to the others.
+
+        Parameters
+        ----------
+        value : object
+        nbytes : float
+            Its size.
+
+        """
+        told, begin = self._tell(value), int(self._frame.env.now)
+        if self.comm is not None:
+            yield self.comm.gather(float(INT_BYTES))
+            if self.index > 0:
+                yield self.comm.isend(0, nbytes, GATHER_TAG)
+            else:
+                for source in range(1, self.ranks):
+                    yield self.comm.irecv(source, GATHER_TAG)
+            self._frame.timeline.add(self.device, SYNC, begin, int(self._frame.env.now), 0.0, 0.0)
+        return [told[rank] for rank in range(self.ranks)] if self.index == 0 else None
+
+    def broadcast(self, value: T | None, nbytes: float) -> Steps:
+        """Give all ranks what rank 0 says."""
+        told, begin = self._tell(value), int(self._frame.env.now)
+        if self.comm is not None:
+            yield self.comm.bcast(nbytes)
+            self._frame.timeline.add(self.device, SYNC, begin, int(self._frame.env.now), 0.0, 0.0)
+        return told[0]
+
+    def tell_each(self, counts: NDArray[np.int64], nbytes: float) -> Steps:
+        """Tell each rank its count, in so many bytes; return what each rank told this one, int64 (ranks,)."""
+        told, begin = self._tell(counts), int(self._frame.env.now)
+        if self.comm is not None:
+            yield self.comm.alltoall(nbytes)
+            self._frame.timeline.add(self.device, SYNC, begin, int(self._frame.env.now), 0.0, 0.0)
+        return np.array([told[rank][self.index] for rank in range(self.ranks)], np.int64)
+
+    def any(self, *, mine: bool) -> Steps:
+        """Ask rank 0 whether something holds on any rank: a flag from each, and the answer to each."""
+        told, begin = self._tell(mine), int(self._frame.env.now)
+        if self.comm is not None:
+            yield self.comm.gather(float(INT_BYTES))
+            yield self.comm.bcast(float(INT_BYTES))
+            self._frame.timeline.add(self.device, SYNC, begin, int(self._frame.env.now), 0.0, 0.0)
+        return any(told.values())
+
+    def _tell(self, value: object) -> dict[int, Any]:
+        """Say something in a collective; return what all ranks say in it, as far as they have."""
+        told = self._frame.told.setdefault(self._collectives, {})
+        told[self.index] = value
+        if len(told) == self.ranks:  # those who take part hold on to it
+            del self._frame.told[self._collectives]
+        self._collectives += 1
+        self._asked = 0
+        return told
 
     def barrier(self) -> Steps:
         """Wait for all ranks; that is time lost to imbalance, and counts as waiting."""

@@ -2,8 +2,7 @@
 
 Pharr et al., "Rendering complex scenes with memory-coherent ray tracing" (1997), out of core; Navratil et al.,
 "Exploring the spectrum of dynamic scheduling algorithms for scalable distributed-memory ray tracing" (2014), over
-ranks;
-both as Park, Fussell and Navratil, "SpRay: speculative ray scheduling for large data visualization" (2018), section 3
+ranks; both as Park, Fussell and Navratil, "SpRay: speculative ray scheduling for large data visualization" (2018), section 3
 and listing 1, have them for their baselines.
 """
 
@@ -19,11 +18,7 @@ from pydantic import ConfigDict, Field
 from simrender.policies.domain_frame import Steps
 from simrender.policies.domain_rank import DomainRank
 from simrender.policies.queues import fullest
-
-Ids = NDArray[np.int64]
-
-SHADOW, RADIANCE = 0, 1
-"""Message tags."""
+from simrender.policies.rounds import rounds, visit_all
 
 
 @dataclass(frozen=True)
@@ -45,6 +40,8 @@ class LoadAnyOnce:
         Size of a ray in a message: 96 B in the authors' program.
     threads : int, optional
         Cores of a rank that trace; all by default. The paper's in situ renderers use one.
+    owners : tuple of int, optional
+        The rank of each domain in situ; blocks in Morton order by default.
 
     """
 
@@ -55,6 +52,7 @@ class LoadAnyOnce:
     prefer_cached: bool = False
     ray_bytes: Annotated[float, Field(gt=0)] = 96.0
     threads: Annotated[int, Field(ge=1)] | None = None
+    owners: tuple[int, ...] | None = None
 
     @property
     def in_situ(self) -> bool:
@@ -65,48 +63,15 @@ class LoadAnyOnce:
         """Render one frame."""
         me.enqueue(me.camera_rays())
         if self.data == "out_of_core":
-            while (domain := self.choose(me)) is not None:
-                me.explain(me.queues.counts, (domain,))
-                yield from self.visit(me, domain)
-                me.next_step()
+            yield from visit_all(me, lambda: self.choose(me))
         else:
-            yield from self.rounds(me)
+            yield from rounds(me, lambda waiting: me.alike(lambda: self.schedule(me, waiting)), self.ray_bytes)
         yield from me.merge_frame()
 
     def choose(self, me: DomainRank) -> int | None:
         """Choose a domain with most rays (listing 1, line 2)."""
         cached = fullest(me.queues.counts, me.cache.resident) if self.prefer_cached else None
         return fullest(me.queues.counts) if cached is None else cached
-
-    def visit(self, me: DomainRank, domain: int) -> Steps:
-        """Load a domain and process the rays that wait for it (listing 1, lines 3 to 17).
-
-        Shadow rays, and secondary rays as well, are tested in the domain of their birth before they leave it.
-        """
-        me.begin_visit()
-        yield from me.load(domain)
-        rays = me.queues.take(domain)
-        while len(rays):
-            yield from me.trace(domain, rays)
-            onward, done = me.advance(rays)
-            me.enqueue(onward)
-            rays = me.shade(done)
-        me.end_visit(domain)
-
-    def rounds(self, me: DomainRank) -> Steps:
-        """Agree on a schedule, send the rays to where it says, process them; until no ray waits anywhere."""
-        while True:
-            waiting = yield from me.allreduce(me.queues.counts)
-            if not waiting.any():
-                return
-            schedule = self.schedule(me, waiting)
-            me.explain(waiting, tuple(schedule.values()), together=True)
-            yield from self.exchange(me, schedule, waiting)
-            domain = schedule.get(me.index)
-            if domain is not None:
-                yield from self.visit(me, domain)
-            yield from me.barrier()
-            me.next_step()
 
     def schedule(self, me: DomainRank, waiting: NDArray[np.int64]) -> dict[int, int]:
         """Return the domain of each rank that has one this round: the same on all ranks."""
@@ -115,18 +80,3 @@ class LoadAnyOnce:
             return {rank: domain for rank, domain in chosen.items() if domain is not None}
         order = np.argsort(-waiting, kind="stable")[: me.ranks]
         return {rank: int(domain) for rank, domain in enumerate(order) if waiting[domain] > 0}
-
-    def exchange(self, me: DomainRank, schedule: dict[int, int], waiting: NDArray[np.int64]) -> Steps:
-        """Send the rays that wait here for the domains of other ranks, and receive those for this rank's own."""
-        leaving = []
-        for rank, domain in schedule.items():
-            if rank != me.index and me.queues.counts[domain] > 0:
-                shadow, radiance = me.by_kind(me.queues.take(domain))
-                for tag, rays in ((SHADOW, shadow), (RADIANCE, radiance)):
-                    if len(rays):
-                        leaving.append(me.send(rank, rays, tag, len(rays) * self.ray_bytes))
-        if me.index in schedule:
-            domain = schedule[me.index]
-            me.enqueue((yield from me.receive(int(waiting[domain] - me.queues.counts[domain]))))
-        for event in leaving:  # noqa: UP028 - SimPy's events are no generators
-            yield event

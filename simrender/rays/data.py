@@ -82,6 +82,10 @@ def _parts(scene: Scene, how: DomainsCard, card: PublishedCard, published: Publi
         raise SceneError(f"domains.method {how.method}: an unstructured mesh comes in its own parts; use given")
     elements = scene.elements
     assert elements is not None  # noqa: S101 - the caller looked
+    if how.count not in {None, elements.parts}:
+        raise SceneError(
+            f"the unstructured mesh comes in {elements.parts} parts of its own, not in {how.count} domains"
+        )
     low, high = elements.part_bounds
     sizes = np.bincount(elements.part, minlength=len(low)).astype(np.float64)
     share = sizes / sizes.sum()

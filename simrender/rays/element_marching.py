@@ -96,11 +96,14 @@ def march_parts(
     Raises
     ------
     SceneError
-        If the step is not a length above 0.
+        If the step is not a length above 0, or so small that a ray's samples could not be counted.
 
     """
-    if not step > 0.0:
-        raise SceneError(f"the step of a ray march is a length above 0, got {step}")
+    low, high = elements.bounds
+    diagonal = float(np.linalg.norm(high - low))
+    if not step > diagonal / 2**31:
+        least = f"above {diagonal / 2**31:.3g}, the mesh's diagonal over 2^31"
+        raise SceneError(f"the step of a ray march is a length {least}, got {step}")
     hull = _hull(elements)
     mesh = (elements.points, elements.scalars, elements.first, elements.corners, elements.shape, elements.across)
     shell = (hull.corners, hull.behind, hull.first, hull.boxes, hull.root)

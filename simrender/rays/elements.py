@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from simrender.errors import SceneError, SceneWarning
 from simrender.rays.volume import TransferFunction
+from simrender.rays.vtk import read_vtk
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -457,17 +458,11 @@ def read_elements(path: Path) -> Elements:
     if not path.is_file():
         raise SceneError(f"{path}: {'this is a folder, expected a file' if path.is_dir() else 'there is no such file'}")
     try:
-        import pyvista
-    except ImportError:
-        raise SceneError(f"{path}: VTK files need pyvista: pip install 'simrender-cluster[vtk]'") from None
-    try:
-        with pyvista.VtkErrorCatcher() as caught:
-            grid: Any = pyvista.read(path)
-    except Exception as error:
-        raise SceneError(f"{path}: cannot read this file: {' '.join(str(error).split())}") from None
-    if caught.events:
-        reason = " ".join(str(caught.events[0].alert).split())
-        raise SceneError(f"{path}: cannot read this file, which is damaged or cut short: {reason}")
+        grid = read_vtk(path)
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from None
+    import pyvista
+
     if not isinstance(grid, pyvista.UnstructuredGrid):
         raise SceneError(f"{path}: expected an unstructured grid, this is a {type(grid).__name__}")
     try:

@@ -32,6 +32,7 @@ from simrender.errors import SceneError, SceneWarning, did_you_mean
 from simrender.rays.memory import check_memory
 from simrender.rays.scene import F32
 from simrender.rays.volume import TransferFunction, Triple, Volume
+from simrender.rays.vtk import read_vtk
 
 F64 = NDArray[np.float64]
 
@@ -452,10 +453,6 @@ def _is_number(word: str) -> bool:
 
 
 def _read_vtk(path: Path, array: str | None) -> _Grid:
-    try:
-        import pyvista
-    except ImportError:
-        raise SceneError("VTK files are read through pyvista: pip install 'simrender-cluster[vtk]'") from None
     with path.open("rb") as file:
         head = file.read(4096)
     announced = re.search(rb"DIMENSIONS\s+(\d+)\s+(\d+)\s+(\d+)", head)
@@ -466,13 +463,9 @@ def _read_vtk(path: Path, array: str | None) -> _Grid:
         dims = [b - a + 1 for a, b in pairwise(ends)][::2]
     if dims:
         _check_volume_memory(dims, np.dtype(np.float64))
-    try:
-        # VTK writes its complaints to the terminal; here the result tells.
-        with pyvista.VtkErrorCatcher():
-            found: Any = pyvista.read(path)
-    except Exception as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise SceneError(f"cannot read this VTK file, which is damaged or of another kind: {reason}") from None
+    found = read_vtk(path)
+    import pyvista
+
     if not isinstance(found, pyvista.ImageData | pyvista.RectilinearGrid):
         kinds = "image data (structured points) or a rectilinear grid"
         raise SceneError(f"it holds {type(found).__name__}, expected {kinds}")

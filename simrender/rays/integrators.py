@@ -7,7 +7,7 @@ one does is written where its kernel is.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -45,12 +45,15 @@ class AmbientOcclusion:
         How far a shadow ray looks; infinite for the whole scene, as SpRay does.
     bounces : int
         Surface hits of a path, at most.
+    program_image : (width, height, samples), optional
+        Draw the random numbers that the authors' program draws for an image of that size.
 
     """
 
     samples: int = 16
     distance: float = math.inf
     bounces: int = 1
+    program_image: tuple[int, int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,8 @@ class SprayPathTracing:
     specular, shininess : float
         Of the Blinn-Phong model; diffuse reflectance is the surface's own. The paper does not give them; the example of
         the authors' program uses 0.4 and 10.
+    program_image : (width, height, samples), optional
+        Draw the random numbers that the authors' program draws for an image of that size.
 
     """
 
@@ -73,6 +78,7 @@ class SprayPathTracing:
     bounces: int = 3
     specular: float = 0.4
     shininess: float = 10.0
+    program_image: tuple[int, int, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -138,6 +144,17 @@ Integrator = (
     | VolumePathTracing
     | ElementMarching
 )
+
+
+def in_units(integrator: Integrator, factor: float) -> Integrator:
+    """Return an integrator for a scene in other units of length: every length times a factor."""
+    if isinstance(integrator, AmbientOcclusion):
+        return replace(integrator, distance=integrator.distance * factor)
+    if isinstance(integrator, ElementMarching):
+        return replace(integrator, step=integrator.step * factor)
+    return integrator
+
+
 INTEGRATORS: dict[str, type[Integrator]] = {
     "ray_casting": RayCasting,
     "path_tracing": PathTracing,

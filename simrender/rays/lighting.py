@@ -50,7 +50,7 @@ def shade(
         rays["diffuse"], hits.primitive, hits.u, hits.v,
         surfaces.vertices, surfaces.faces, surfaces.normals, surfaces.colors, surfaces.material, surfaces.materials,
         surfaces.points, surfaces.hemispheres, surfaces.light_first, surfaces.light_rows,
-        ambient, each, distance, *shine, light.bounces, seed,
+        ambient, each, distance, *shine, light.bounces, seed, *(light.program_image or (0, 0, 0)),
         radiance, children, out["origin"], out["origin"].view(np.int32), out["direction"], out["throughput"],
         out["reach"], out["parent"], out["kind"],
     )  # fmt: skip
@@ -63,10 +63,56 @@ def shade(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def _program_direction(number, pair, nx, ny, nz):  # type: ignore[no-untyped-def]
+    """Return the cosine-distributed direction about a normal that SpRay's program draws.
+
+    Its random numbers are a linear congruential sequence that begins with the Murmur3 hash of a number; ``pair`` pairs
+    of them were drawn before. A pair is mapped to the disk concentrically (Shirley and Chiu, "A low distortion map
+    between disk and square", 1997).
+    """
+    mask = np.int64(0xFFFFFFFF)
+    k = (np.int64(number) & mask) * 0xCC9E2D51 & mask
+    k = (k << 15 | k >> 17) & mask
+    k = k * 0x1B873593 & mask
+    s = ((k << 13 | k >> 19) & mask) * 5 + 0xE6546B64 & mask
+    s ^= s >> 16
+    s = s * 0x85EBCA6B & mask
+    s ^= s >> 13
+    s = s * 0xC2B2AE35 & mask
+    s ^= s >> 16
+    for _ in range(2 * pair + 1):
+        s = s * 1664525 + 1013904223 & mask
+    a = 2.0 * np.float64(np.float32(s >> 1) * np.float32(2.0**-31)) - 1.0
+    s = s * 1664525 + 1013904223 & mask
+    b = 2.0 * np.float64(np.float32(s >> 1) * np.float32(2.0**-31)) - 1.0
+    if a == 0.0 and b == 0.0:
+        r, theta = 0.0, 0.0
+    elif a >= -b:
+        if a > b:
+            r, theta = a, (b / a if b > 0.0 else 8.0 + b / a)
+        else:
+            r, theta = b, 2.0 - a / b
+    elif a <= b:
+        r, theta = -a, 4.0 - b / -a
+    else:
+        r, theta = -b, 6.0 + a / -b
+    x, y = r * math.cos(0.25 * math.pi * theta), r * math.sin(0.25 * math.pi * theta)
+    z = math.sqrt(max(0.0, 1.0 - x * x - y * y))
+    if nz * nz + ny * ny > nz * nz + nx * nx:
+        ux, uy, uz = 0.0, nz, -ny
+    else:
+        ux, uy, uz = -nz, 0.0, nx
+    length = math.sqrt(ux * ux + uy * uy + uz * uz)
+    ux, uy, uz = ux / length, uy / length, uz / length
+    vx, vy, vz = ny * uz - nz * uy, nz * ux - nx * uz, nx * uy - ny * ux
+    return ux * x + vx * y + nx * z, uy * x + vy * y + ny * z, uz * x + vz * y + nz * z
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def _light(  # type: ignore[no-untyped-def]
     direction, throughput, pixel, sample, kind, depth, primitive, u, v,
     vertices, faces, normals, colors, material_of, materials, points, hemispheres, light_first, light_rows,
-    ambient, each, distance, specular, shininess, bounces, seed,
+    ambient, each, distance, specular, shininess, bounces, seed, width, height, samples,
     radiance, children, out_origin, out_bits, out_direction, out_throughput, out_reach, out_parent, out_kind,
 ):  # fmt: skip
     n_out = 0
@@ -105,6 +151,9 @@ def _light(  # type: ignore[no-untyped-def]
                 radiance[i, c] = throughput[i, c] * materials[m, 4 + c]
         tr, tg, tb = np.float64(throughput[i, 0]), np.float64(throughput[i, 1]), np.float64(throughput[i, 2])
         key = path_key(seed, pixel[i], sample[i], 1 + depth[i])
+        number = 0
+        if width > 0:  # the program counts its pixels from the lowest line up
+            number = (height - 1 - pixel[i] // width) * width + pixel[i] % width
         first = n_out
 
         for ray in range(shadows):
@@ -113,7 +162,10 @@ def _light(  # type: ignore[no-untyped-def]
             mx, my, mz = 0.0, 0.0, 0.0  # normal of an area light, on the surface's side
             lit = False
             if ray < ambient:
-                wx, wy, wz = cosine_direction(sx, sy, sz, uniform(key, dimension), uniform(key, dimension + 1))
+                if width > 0:
+                    wx, wy, wz = _program_direction(number * (ray + 1), 0, sx, sy, sz)
+                else:
+                    wx, wy, wz = cosine_direction(sx, sy, sz, uniform(key, dimension), uniform(key, dimension + 1))
                 lr, lg, lb = ar / ambient, ag / ambient, ab / ambient
                 reach = distance
             else:
@@ -147,7 +199,11 @@ def _light(  # type: ignore[no-untyped-def]
                     er, eg, eb = light_rows[low, 12], light_rows[low, 13], light_rows[low, 14]
                     lit = True
                 elif index >= n_area:
-                    wx, wy, wz = cosine_direction(sx, sy, sz, uniform(key, dimension), uniform(key, dimension + 1))
+                    if width > 0:
+                        own = (number * samples + sample[i]) * (depth[i] + 1)
+                        wx, wy, wz = _program_direction(own, ray - ambient, sx, sy, sz)
+                    else:
+                        wx, wy, wz = cosine_direction(sx, sy, sz, uniform(key, dimension), uniform(key, dimension + 1))
                     cosine = wx * sx + wy * sy + wz * sz
                     if cosine <= 0.0:
                         continue
@@ -207,7 +263,10 @@ def _light(  # type: ignore[no-untyped-def]
             n_out += 1
 
         if depth[i] + 1 < bounces and max(tr * ar, tg * ag, tb * ab) > 0.0:
-            wx, wy, wz = cosine_direction(sx, sy, sz, uniform(key, _DIRECTION), uniform(key, _DIRECTION + 1))
+            if width > 0:
+                wx, wy, wz = _program_direction((number * samples + sample[i]) * (depth[i] + 1), 0, sx, sy, sz)
+            else:
+                wx, wy, wz = cosine_direction(sx, sy, sz, uniform(key, _DIRECTION), uniform(key, _DIRECTION + 1))
             side = 1.0 if wx * gx + wy * gy + wz * gz >= 0.0 else -1.0
             out_origin[n_out, 0], out_origin[n_out, 1], out_origin[n_out, 2] = px, py, pz
             offset_origin(out_origin, out_bits, n_out, side * gx, side * gy, side * gz)

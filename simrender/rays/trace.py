@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 
 from simrender.errors import SceneWarning
 from simrender.rays import embree
-from simrender.rays.integrators import Integrator
+from simrender.rays.integrators import Integrator, in_units
 from simrender.rays.kinds import CAMERA, KINDS
 from simrender.rays.memory import check_memory
 from simrender.rays.precision import out_of_range
@@ -249,7 +249,7 @@ class Trace:
         """The scene, ready for the integrator."""
         from simrender.rays.worlds import world
 
-        return world(self.scene, self.integrator) if self._like is None else self._like.world
+        return world(self.scene, in_units(self.integrator, self.factor)) if self._like is None else self._like.world
 
     def _know(self, ray: int) -> None:
         while self.first[-1] <= ray:

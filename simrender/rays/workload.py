@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -16,7 +17,7 @@ from simrender.cards import Document
 from simrender.catalog import find_card, load_function
 from simrender.errors import CardError, SceneError, UsageError
 from simrender.rays.files import FORMATS, SceneFile, read_file
-from simrender.rays.integrators import Integrator, PathTracing
+from simrender.rays.integrators import AmbientOcclusion, Integrator, PathTracing, SprayPathTracing
 from simrender.rays.partition import Footprint, Method, Partition, Published, partition, pieces
 from simrender.rays.scene import F32, Scene
 from simrender.rays.trace import Progress, Trace
@@ -101,6 +102,10 @@ class Workload:
         """The published size of the scene."""
         card, scene = self.card.published, self.scene
         own_bytes = sum(m.vertices.nbytes + m.faces.nbytes for m in scene.meshes)
+        if scene.volume is not None:
+            own_bytes += scene.volume.voxels.nbytes
+        if (elements := scene.elements) is not None:
+            own_bytes += sum(a.nbytes for a in (elements.points, elements.scalars, elements.corners, elements.kind))
         unique = card.triangles or scene.unique_triangles
         instanced = unique * scene.instanced_triangles / max(1, scene.unique_triangles)
         return Published(
@@ -145,6 +150,9 @@ class Workload:
         if not 0 <= number < of:
             raise UsageError(f"frame {number} of {of}: expected 0 to {of - 1}")
         camera = self.card.camera.at(number / (of - 1) if of > 1 else 0.0)
+        rounding = 1e-9 * (np.linalg.norm(camera.position) + np.linalg.norm(camera.look_at))
+        if not np.linalg.norm(np.cross(np.subtract(camera.look_at, camera.position), camera.up)) > rounding:
+            raise UsageError(f"frame {number} of {of}: the camera's path leads through what it looks at, or along up")
         card = self.card.model_copy(update={"camera": camera.model_copy(update={"path": ()})})
         boxes = None if self.content.low is None or self.content.high is None else (self.content.low, self.content.high)
         return replace(
@@ -156,7 +164,12 @@ class Workload:
         """How light is followed."""
         if self.card.integrator.name == "path_tracing":
             return PathTracing(**self.card.bounces.model_dump())
-        return self.card.integrator.value()
+        integrator = self.card.integrator.value()
+        if self.card.integrator.random_numbers == "own" or not isinstance(
+            integrator, AmbientOcclusion | SprayPathTracing
+        ):
+            return integrator
+        return replace(integrator, program_image=(*self.card.traced.resolution, self.samples))
 
     def trace(self, seed: int = 1, progress: Progress | None = None) -> Trace:
         """Return the ray table for a seed; nothing is traced before it is asked for."""
@@ -330,11 +343,12 @@ def _file_card(path: Path, content: SceneFile) -> Document:
 def _card(
     path: Path, position: Any, look_at: Any, up: Any, fov: float, published: str, traced: str, rest: str, sampling: str
 ) -> Document:
+    name = json.dumps(path.name, ensure_ascii=False)  # JSON's strings are YAML's
     text = f"""\
-title: {path.name!r}
+title: {name}
 published: {published}
 traced: {traced}
-scene: {{file: {path.name!r}}}
+scene: {{file: {name}}}
 camera:
   position: {position.tolist()}
   look_at: {look_at.tolist()}

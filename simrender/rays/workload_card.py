@@ -193,10 +193,18 @@ class IntegratorCard(Card):
     opacity_limit: Annotated[float, Field(gt=0, le=1)] | None = None
     shadow_probability: Annotated[float, Field(ge=0, lt=1)] | None = None
     roulette: Annotated[float, Field(ge=0, le=1)] | None = None
+    random_numbers: Literal["own", "spray_program"] = "own"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_name_alone(cls, value: Any) -> Any:
+        return {"name": value} if isinstance(value, str) else value
 
     @model_validator(mode="after")
     def _takes_its_parameters(self) -> IntegratorCard:
         known = [f.name for f in dataclasses.fields(INTEGRATORS[self.name])] if self.name != "path_tracing" else []
+        if "program_image" in known:
+            known[-1] = "random_numbers"
         for name in sorted(self.model_fields_set - {"name", *known}):
             if self.name == "path_tracing":
                 raise ValueError(f"path_tracing takes no {name} here; its parameters are in the section bounces")
@@ -207,7 +215,8 @@ class IntegratorCard(Card):
 
     def value(self) -> Integrator:
         """Return the integrator."""
-        return INTEGRATORS[self.name](**{k: v for k, v in self.model_dump(exclude_unset=True).items() if k != "name"})
+        own = {"name", "random_numbers"}
+        return INTEGRATORS[self.name](**{k: v for k, v in self.model_dump(exclude_unset=True).items() if k not in own})
 
 
 class DomainsCard(Card):

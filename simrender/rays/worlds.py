@@ -214,7 +214,7 @@ class _Backdrop:
         def work(rows: slice) -> embree.Hits:
             return geometry.nearest(rays["origin"][rows], rays["direction"][rows], rays["reach"][rows])
 
-        parts = embree.in_chunks(work, len(rays["reach"]))
+        parts = [work(slice(0, 0)), *embree.in_chunks(work, len(rays["reach"]))]
         columns = ([getattr(p, name) for p in parts] for name in ("t", "primitive", "u", "v"))
         return embree.Hits(*(np.concatenate(column) for column in columns))
 
@@ -343,17 +343,20 @@ class ElementWorld:
 
         def block(some: Columns) -> Columns:
             n = len(some["kind"])
+            hits = self.backdrop.hits(some)
+            if hits is not None:
+                some = some | {"reach": np.minimum(some["reach"], hits.t)}
             entered = enter_boxes(some["origin"], some["direction"], some["reach"], low, high)
             ray = np.repeat(np.arange(n), np.diff(entered.first))
             found = self.fragments(some, ray, entered.domain)
             owner = ray[found.row]
             rgba = composite(found.rgba, found.entry, owner, entered.domain[found.row], n)
-            t = np.full(n, np.inf, np.float32)
+            t = np.full(n, np.inf, np.float32) if hits is None else hits.t.copy()
             np.minimum.at(t, owner, found.entry)
-            seen = rgba[:, :3] + (1.0 - rgba[:, 3:]) * self.backdrop.colors(some, None)
+            seen = rgba[:, :3] + (1.0 - rgba[:, 3:]) * self.backdrop.colors(some, hits)
             return {
                 "t": t,
-                "primitive": np.full(n, -1, np.int32),
+                "primitive": np.full(n, -1, np.int32) if hits is None else hits.primitive,
                 "radiance": (some["throughput"] * seen).astype(np.float32),
                 "work": np.bincount(ray, found.elements, minlength=n).astype(np.uint32),
                 "samples": np.bincount(ray, found.samples, minlength=n).astype(np.uint32),

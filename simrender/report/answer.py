@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _BARS = {
     "load": ("▚", "yellow"),
-    "sync": ("╱", "magenta"),
+    "sync": ("▞", "magenta"),
     "trace": ("█", "green"),
     "shade": ("▓", "dark_green"),
     "copy": ("▒", "blue"),
@@ -125,8 +125,8 @@ def _infeasible(result: Result) -> list[Any]:
         return [
             Text(f"{result.workload} does not fit on {result.machine} under {result.policy}", style="bold red"),
             Text(
-                f"The data take {format_bytes(m['model_bytes'])} of {capacity} on the fullest {noun}, and the rays that "
-                f"are in flight there another {format_bytes(m['peak_rays_bytes'])}."
+                f"The data take {format_bytes(m['model_bytes'])} of {capacity} on the fullest {noun}, and the rays in "
+                f"flight there another {format_bytes(m['peak_rays_bytes'])}."
             ),
         ]
     lines = [

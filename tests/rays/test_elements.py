@@ -317,12 +317,12 @@ def test_what_cannot_be_read_is_refused(tmp_path, hexbeam, monkeypatch):
     (tmp_path / "folder.vtu").mkdir()
     refused[tmp_path / "folder.vtu"] = "this is a folder"
     (tmp_path / "cut.vtu").write_text("<VTKFile type='UnstructuredGrid'><Unstruc")
-    refused[tmp_path / "cut.vtu"] = "cut.vtu: cannot read this file"
+    refused[tmp_path / "cut.vtu"] = "cut.vtu: cannot read this VTK file"
     for path, message in refused.items():
         with pytest.raises(SceneError, match=message):
             read_elements(path)
     monkeypatch.setitem(sys.modules, "pyvista", None)
-    with pytest.raises(SceneError, match=r"need pyvista: pip install 'simrender-cluster\[vtk\]'"):
+    with pytest.raises(SceneError, match=r"through pyvista: pip install 'simrender-cluster\[vtk\]'"):
         read_elements(hexbeam)
 
 

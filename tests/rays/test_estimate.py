@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from simrender.errors import UsageError
 from simrender.rays.estimate import estimate, over_replicas, seeds
+from tests.conftest import Ran
 from tests.scenes import garden_workload
 from workloads.terrain import generator
 
@@ -126,3 +130,55 @@ def test_small_traces_estimate_a_large_one() -> None:
     assert held >= 34  # of 40; 38 are expected
     assert all(0.0 < f.half_width < 0.1 * truth for f in found)
     assert np.mean([f.mean for f in found]) == pytest.approx(truth, rel=2e-3)
+
+
+# simrender trace --replicas
+
+Found = Callable[..., dict[str, Any]]
+WAVELETS = Path(__file__).parent.parent / "data" / "wavelets64.spray"
+
+
+@pytest.fixture
+def trace(run_cli: Callable[..., Ran]) -> Found:
+    """Trace a workload on the command line; return its JSON."""
+    return lambda *arguments: json.loads(run_cli("trace", *arguments, "--json", "-").out)
+
+
+def test_replicas_estimate_what_is_published(trace: Found, tiny_card: Path) -> None:
+    found = trace(tiny_card, "--resolution", "32x18", "--replicas", 6)
+    whole = trace(tiny_card)
+    estimates = found["estimates"]
+    assert {e["replicas"] for e in estimates.values()} == {6}
+    assert {e["confidence"] for e in estimates.values()} == {0.95}
+    camera = estimates["camera rays"]
+    assert (camera["mean"], camera["half_width"]) == (64 * 36 * 2, 0.0)
+    hits = estimates["camera hits"]
+    assert abs(hits["mean"] - whole["camera_hits"]) < 3 * hits["half_width"]
+    assert 0.0 < hits["half_width"] < 0.1 * hits["mean"]
+    assert [name for name in estimates if "domain" in name] == [f"rays that enter domain {d}" for d in range(8)]
+    assert estimates["mean radiance"]["mean"] == pytest.approx(0.58, abs=0.05)
+    plain = {k: v for k, v in found.items() if k != "estimates"}
+    assert plain == trace(tiny_card, "--resolution", "32x18")
+    assert "estimates" not in plain
+
+
+def test_more_replicas_are_surer(trace: Found, tiny_card: Path) -> None:
+    few, many = (trace(tiny_card, "--resolution", "32x18", "--replicas", n)["estimates"] for n in (3, 30))
+    names = [name for name in few if few[name]["half_width"] > 0.0]
+    assert len(names) > 8
+    assert np.median([many[name]["half_width"] / few[name]["half_width"] for name in names]) < 0.5
+
+
+def test_replicas_need_not_all_have_rays_of_a_kind(run_cli: Callable[..., Ran], tiny_card: Path) -> None:
+    """So few rays that some replicas hit nothing, whichever comes first."""
+    for seed in range(1, 7):
+        ran = run_cli("trace", tiny_card, "--resolution", "2x1", "--set", "workload.published.samples=1",
+                      "--replicas", 8, "--seed", seed)  # fmt: skip
+        assert ran.code == 0, ran
+        assert "from 8 independent replicas" in ran.out
+        assert "scatter rays" not in ran.out
+
+
+def test_replicas_without_random_numbers_do_not_claim_to_be_exact(run_cli: Callable[..., Ran]) -> None:
+    ran = run_cli("trace", WAVELETS, "--resolution", "32x32", "--replicas", 3)
+    assert "± 0.00%" not in ran.out

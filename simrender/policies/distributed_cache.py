@@ -1,0 +1,453 @@
+"""Distributed cache ray tracing: rays stay with the node that has their pixels, and blocks of data travel.
+
+Ize et al., "Real-time ray tracer for visualization on a cluster", section 5: the image is divided among nodes by a load
+balancer on two levels (5.1), finished pixels go to a display process (5.2), and what a node does not have of the scene
+it fetches in blocks of almost 8 KB into a direct-mapped cache (5.3), which stays warm from frame to frame.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Generator
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+import simpy
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+
+from simrender.clock import to_ticks
+from simrender.hardware.cache import MISS, NODE_BLOCK_BYTES, TRIANGLE_BLOCK_BYTES, BlockMap, DirectMappedCache
+from simrender.hardware.display import Display, message_layout
+from simrender.hardware.machine import Machine
+from simrender.hardware.storage import BlockFetcher
+from simrender.policies.tiles import TiledFrame
+from simrender.rays.blocks import PACKET_RAYS
+from simrender.timeline import KERNELS, KINDS, Timeline
+
+Steps = Generator[simpy.Event, Any, Any]
+
+TRACE, LOAD = KINDS.index(KERNELS[1]), KINDS.index("load")
+
+TILE_MESSAGE_BYTES = 32.0
+"""A request for a tile, and the tile: a few integers."""
+
+
+@dataclass(frozen=True)
+class DistributedCache:
+    """Tiles of the image dealt to nodes, whose threads fetch the blocks of the scene that their rays need.
+
+    Parameters
+    ----------
+    cache : str
+        What a node keeps of the data, its own blocks and the cache together, as in the paper's 1/N: a share such as
+        ``12.5%``, a size such as ``2 GiB`` of the published data, or ``all``.
+    mapping : "ize" or "demarle"
+        Which line of the cache a block has; see `simrender.hardware.cache.BlockMap`.
+    threads : int, optional
+        Render threads of a node; one a core by default.
+    tile : int
+        Side, in published pixels, of the tiles that the master hands out; to the nearest whole number of packets.
+    static : float
+        Share of the tiles that nodes begin with, the same ones in each frame; at least one each if there are enough.
+    packets : int
+        Packets of 64 pixels that a thread takes from its node's queue at once.
+    blocks : "scaled" or "full"
+        The traced mesh stands for a larger one, and a traced ray for many. In blocks that are smaller by as much as
+        there are fewer rays for each triangle, a packet of rays meets as many blocks as it would in the published
+        scene. Full blocks have 254 nodes or 226 triangles whatever they stand for.
+    fetches : "grouped" or "single"
+        Whether the gets of a thread's packets are one flow from one owner, as fast as one get after the other would be,
+        or each is simulated, with the locks of the cache's lines. The latter needs a workload that is traced at its
+        published resolution.
+    display : bool, optional
+        Whether pixels go to the machine's display; by default if it has one.
+    warm_up : int
+        How often the first frame is rendered before frames count.
+
+    """
+
+    __pydantic_config__: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+
+    cache: str = "all"
+    mapping: Literal["ize", "demarle"] = "ize"
+    threads: Annotated[int, Field(ge=1)] | None = None
+    tile: Annotated[int, Field(ge=1)] = 64
+    static: Annotated[float, Field(ge=0.0, le=1.0)] = 0.5
+    packets: Annotated[int, Field(ge=1)] = 4
+    blocks: Literal["scaled", "full"] = "scaled"
+    fetches: Literal["grouped", "single"] = "grouped"
+    display: bool | None = None
+    warm_up: Annotated[int, Field(ge=0)] = 1
+
+    def node(self, me: RenderNode) -> Steps:
+        """Render all frames on one node."""
+        for frame in range(me.frames):
+            yield from me.begin(frame)
+            yield me.together([self.thread(me, thread) for thread in range(me.threads)])
+            me.end()
+
+    def thread(self, me: RenderNode, thread: int) -> Steps:
+        """Render packets until the master has no more tiles."""
+        while True:
+            work = me.take()
+            if work is not None:
+                yield from me.render(thread, work)
+            elif not (yield from me.ask()):
+                break
+        me.flush(thread)
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """What a thread takes from the queue.
+
+    Attributes
+    ----------
+    packets : list of int
+    pixels : int
+        Published ones; of the packets, or a part of them where they stand for several published packets.
+    seconds : float
+        That one core takes.
+    gets : int
+        Blocks to fetch.
+    fetched_bytes : float
+    owner : int
+        The rank that has one of the blocks.
+
+    """
+
+    packets: list[int]
+    pixels: int
+    seconds: float
+    gets: int
+    fetched_bytes: float
+    owner: int
+
+
+@dataclass
+class FrameCounts:
+    """How much of everything there was in one frame, over all nodes; references and misses are traced ones.
+
+    Attributes
+    ----------
+    residents, hits, misses : int
+    gets : int
+        Published ones, as are the bytes.
+    fetched_bytes : float
+    tiles, requests : int
+        Tiles handed out; questions for another one.
+    messages : int
+        To the display.
+    trace_ticks, fetch_ticks : list of int
+        What the threads of each node took for it.
+    packets : list of int
+        Rendered, in order.
+    complete_at : int
+        The tick at which the display had the last pixel, or the last thread was done without a display.
+
+    """
+
+    residents: int = 0
+    hits: int = 0
+    misses: int = 0
+    gets: int = 0
+    fetched_bytes: float = 0.0
+    tiles: int = 0
+    requests: int = 0
+    messages: int = 0
+    trace_ticks: list[int] = field(default_factory=list)
+    fetch_ticks: list[int] = field(default_factory=list)
+    packets: list[int] = field(default_factory=list)
+    complete_at: int = 0
+
+
+class Cluster:
+    """What the nodes of one simulation share: the frames, the master that deals tiles, and the display.
+
+    Parameters
+    ----------
+    env : simpy.Environment
+    machine : Machine
+        One node more than render: the last one has the master and the display process.
+    policy : DistributedCache
+    frames : list of TiledFrame
+        One after the other; those to warm up are among them.
+    lines : (int, int)
+        Lines of a node's cache of blocks of nodes, and of triangles.
+    display : Display or None
+
+    """
+
+    def __init__(
+        self,
+        env: simpy.Environment,
+        machine: Machine,
+        policy: DistributedCache,
+        frames: list[TiledFrame],
+        lines: tuple[int, int],
+        display: Display | None,
+    ) -> None:
+        self.env, self.machine, self.policy, self.frames, self.display = env, machine, policy, frames, display
+        self.ranks = self.master = machine.nodes - 1
+        self.threads = policy.threads or getattr(machine.card.processor, "cores", 1)
+        self.maps = (
+            BlockMap(self.ranks, lines[0], policy.mapping),
+            BlockMap(self.ranks, lines[1], policy.mapping, root=None),
+        )
+        names = [f"node{rank}.thread{k}" for rank in range(self.ranks) for k in range(self.threads)]
+        self.timeline = Timeline(len(names), names)
+        self.counts = [FrameCounts(trace_ticks=[0] * self.ranks, fetch_ticks=[0] * self.ranks) for _ in frames]
+        self._complete = [env.event() for _ in frames]
+        self._running = [self.ranks] * len(frames)
+        self._dealt = [self.begins_with(frame, self.ranks).start for frame in frames]
+
+    def begins_with(self, frame: TiledFrame, rank: int) -> range:
+        """Return the tiles that a node begins a frame with; those from that of the first rank too many on are dealt."""
+        each = max(int(self.policy.static * frame.tiles / self.ranks), 1)
+        first = min(rank * each, frame.tiles)
+        return range(first, min(first + each, frame.tiles))
+
+    def next_tile(self, frame: int) -> int | None:
+        """Deal the next tile of a frame, if there is one."""
+        tile = self._dealt[frame]
+        if tile == self.frames[frame].tiles:
+            return None
+        self._dealt[frame] += 1
+        return tile
+
+    def may_begin(self, frame: int) -> simpy.Event:
+        """Return what happens when a frame may begin: the display has room, or the one before is rendered."""
+        if self.display is not None:
+            return self.display.may_send(frame)
+        return self._complete[frame - 1] if frame else self.env.timeout(0)
+
+    def finish(self, frame: int) -> None:
+        """Learn that a node has rendered its part of a frame."""
+        self._running[frame] -= 1
+        if self._running[frame] == 0 and self.display is None:
+            self.counts[frame].complete_at = int(self.env.now)
+            self._complete[frame].succeed()
+
+    def show(self, frame: int, rank: int, pixels: int) -> None:
+        """Send a message with pixels to the display."""
+        assert self.display is not None  # noqa: S101 - who calls has seen to it
+        wire = message_layout(self.display.card, pixels).wire_bytes
+        sent = self.machine.network.transfer(("host", rank), ("display", 0), float(wire))
+        assert sent.callbacks is not None  # noqa: S101 - it lies in the future
+        sent.callbacks.append(partial(self._arrive, frame, pixels))
+        self.counts[frame].messages += 1
+
+    def _arrive(self, frame: int, pixels: int, sent: simpy.Event) -> None:
+        assert self.display is not None  # noqa: S101 - see above
+        if sent.ok:
+            done = self.display.deliver(frame, pixels)
+            if done.callbacks is not None and not done.callbacks:
+                done.callbacks.append(partial(self._shown, frame))
+
+    def _shown(self, frame: int, _: simpy.Event) -> None:
+        self.counts[frame].complete_at = int(self.env.now)
+
+
+class RenderNode:
+    """One node, as the policy sees it.
+
+    Attributes
+    ----------
+    rank, threads, frames : int
+
+    """
+
+    def __init__(self, cluster: Cluster, rank: int) -> None:
+        self._cluster, self.rank = cluster, rank
+        self.threads, self.frames = cluster.threads, len(cluster.frames)
+        self._slowness = cluster.machine.processor(rank).slowness
+        self._caches = [DirectMappedCache(blocks, rank) for blocks in cluster.maps]
+        self._queue: deque[int] = deque()
+        self._taken = 0  # published pixels of the first packet in the queue
+        self._asking: simpy.Event | None = None
+        self._unsent = [0] * self.threads
+        self._number = -1
+        self._seen = (0, 0, 0)
+        self._fetchers = []
+        if cluster.policy.fetches == "single":
+            hosts = [("host", r) for r in range(cluster.ranks)]
+            sizes = (NODE_BLOCK_BYTES, TRIANGLE_BLOCK_BYTES)
+            self._fetchers = [
+                BlockFetcher(cluster.env, cluster.machine.network, cache, hosts, nbytes)
+                for cache, nbytes in zip(self._caches, sizes, strict=True)
+            ]
+
+    # -- frames ---------------------------------------------------------------------------------------------------
+
+    def begin(self, frame: int) -> Steps:
+        """Wait until a frame may begin, wake the threads, and queue the tiles that are this node's in every frame."""
+        cluster = self._cluster
+        yield cluster.may_begin(frame)
+        yield cluster.env.timeout(to_ticks(float(cluster.machine.card.processor.launch_latency)))
+        self._number, self._frame, self._counts = frame, cluster.frames[frame], cluster.counts[frame]
+        packets = len(self._frame.pixels)
+        self._gets = np.zeros(packets, np.int64)
+        self._get_bytes = np.zeros(packets)
+        self._owners: dict[int, NDArray[np.int64]] = {}
+        self._over = False
+        for tile in cluster.begins_with(self._frame, self.rank):
+            self._queue_tile(tile)
+
+    def together(self, threads: list[Steps]) -> simpy.Event:
+        """Return what happens when all threads are done."""
+        env = self._cluster.env
+        return env.all_of([env.process(thread) for thread in threads])
+
+    def end(self) -> None:
+        """Count what the frame took."""
+        now = tuple(sum(getattr(c, name) for c in self._caches) for name in ("residents", "hits", "misses"))
+        delta = [a - b for a, b in zip(now, self._seen, strict=True)]
+        self._seen = now
+        self._counts.residents += delta[0]
+        self._counts.hits += delta[1]
+        self._counts.misses += delta[2]
+        self._cluster.finish(self._number)
+
+    # -- the two queues -------------------------------------------------------------------------------------------
+
+    def take(self) -> Work | None:
+        """Take packets from the node's queue; None if it is empty."""
+        frame, left = self._frame, self._cluster.policy.packets * PACKET_RAYS
+        if not self._queue:
+            return None
+        packets, pixels, seconds, gets, nbytes, owner = [], 0, 0.0, 0, 0.0, self.rank
+        while left and self._queue:
+            packet, begin = self._queue[0], self._taken
+            size, due = int(frame.pixels[packet]), int(self._gets[packet])
+            some = min(left, size - begin)
+            seconds += float(frame.seconds[packet]) * (some / size if size else 1.0)
+            if due:
+                issued = due * begin // size
+                new = due * (begin + some) // size - issued
+                if new and not gets:
+                    owners = self._owners[packet]
+                    owner = int(owners[(issued + new // 2) * len(owners) // due])
+                gets += new
+                nbytes += new * float(self._get_bytes[packet])
+            pixels, left, self._taken = pixels + some, left - some, begin + some
+            if self._taken == size:
+                self._queue.popleft()
+                self._taken = 0
+                packets.append(packet)
+        return Work(packets, pixels, seconds, gets, nbytes, owner)
+
+    def ask(self) -> Steps:
+        """Ask the master for another tile, or wait for it if another thread has asked; return whether to go on."""
+        cluster = self._cluster
+        if self._over:
+            return False
+        if self._asking is not None:
+            yield self._asking
+            return not self._over
+        self._asking = asking = cluster.env.event()
+        self._counts.requests += 1
+        yield cluster.machine.copy(self.rank, cluster.master, TILE_MESSAGE_BYTES)
+        tile = cluster.next_tile(self._number)
+        yield cluster.machine.copy(cluster.master, self.rank, TILE_MESSAGE_BYTES)
+        self._asking = None
+        if tile is None:
+            self._over = True
+        else:
+            self._queue_tile(tile)
+        asking.succeed()
+        return not self._over
+
+    def _queue_tile(self, tile: int) -> None:
+        """Queue the packets of a tile, and find out which of their references miss."""
+        frame = self._frame
+        begin, end = int(frame.first[tile]), int(frame.first[tile + 1])
+        self._counts.tiles += 1
+        self._queue.extend(range(begin, end))
+        if self._fetchers or self._cluster.ranks == 1:
+            return
+        owners, packet_of = [], []
+        for cache, stream, nbytes in zip(
+            self._caches, frame.streams, (NODE_BLOCK_BYTES, TRIANGLE_BLOCK_BYTES), strict=True
+        ):
+            first, last = stream.first[begin], stream.first[end]
+            refers = stream.block[first:last]
+            missed = np.flatnonzero(cache.replay(refers) == MISS)
+            of = np.searchsorted(stream.first, missed + first, side="right") - 1
+            owners.append(cache.blocks.owner(refers[missed].astype(np.int64)))
+            packet_of.append(of)
+            count = np.bincount(of - begin, minlength=end - begin)
+            self._gets[begin:end] += count
+            self._get_bytes[begin:end] += count * float(nbytes)
+        misses = self._gets[begin:end]
+        self._get_bytes[begin:end] /= np.maximum(misses, 1)
+        order = np.argsort(np.concatenate(packet_of), kind="stable")
+        parts = np.split(np.concatenate(owners)[order], np.cumsum(misses)[:-1])
+        self._owners.update((begin + i, part) for i, part in enumerate(parts) if len(part))
+        self._gets[begin:end] = np.rint(misses * frame.weight).astype(np.int64)
+
+    # -- what threads do ------------------------------------------------------------------------------------------
+
+    def render(self, thread: int, work: Work) -> Steps:
+        """Trace packets, fetch the blocks that they miss, and send the pixels on."""
+        cluster, counts = self._cluster, self._counts
+        row, begin = self.rank * self.threads + thread, int(cluster.env.now)
+        ticks = to_ticks(work.seconds * self._slowness)
+        yield cluster.env.timeout(ticks)
+        counts.trace_ticks[self.rank] += ticks
+        cluster.timeline.add(row, TRACE, begin, begin + ticks, 0.0, work.pixels)
+        begin += ticks
+        nbytes = work.fetched_bytes
+        if self._fetchers:
+            nbytes = yield from self._fetch_singly(thread, work.packets)
+        elif work.gets:
+            yield self._get(work)
+        if nbytes:
+            end = int(cluster.env.now)
+            counts.fetch_ticks[self.rank] += end - begin
+            cluster.timeline.add(row, LOAD, begin, end, nbytes, 0.0)
+        counts.gets += work.gets
+        counts.fetched_bytes += nbytes
+        counts.packets += work.packets
+        self._send(thread, work.pixels)
+
+    def _get(self, work: Work) -> simpy.Event:
+        """Get blocks one after the other: alone, each takes its request's latency, the answer's, and its bytes.
+
+        They are one flow that is never faster than that. Where threads share a link, what they have of it is less, and
+        the latencies of one pass while others use it.
+        """
+        network = self._cluster.machine.network
+        source, target = ("host", work.owner), ("host", self.rank)
+        latency = network.latency_ticks(source, target) / 1e12
+        alone = 2.0 * latency * work.gets + work.fetched_bytes / network.bandwidth(source, target)
+        return network.transfer(source, target, work.fetched_bytes, cap=work.fetched_bytes / (alone - latency))
+
+    def _fetch_singly(self, thread: int, packets: list[int]) -> Steps:
+        """Refer to each block in turn; return the bytes that were fetched for this thread."""
+        nbytes = 0.0
+        for packet in packets:
+            for fetcher, stream in zip(self._fetchers, self._frame.streams, strict=True):
+                for block in stream.block[stream.first[packet] : stream.first[packet + 1]].tolist():
+                    if (yield from fetcher.fetch(thread, block)) == MISS:
+                        nbytes += fetcher.block_bytes
+                        self._counts.gets += 1
+                fetcher.release(thread)
+        return nbytes
+
+    def _send(self, thread: int, pixels: int) -> None:
+        display = self._cluster.display
+        if display is None:
+            return
+        self._unsent[thread] += pixels
+        while self._unsent[thread] >= display.card.message_pixels:
+            self._unsent[thread] -= display.card.message_pixels
+            self._cluster.show(self._number, self.rank, display.card.message_pixels)
+
+    def flush(self, thread: int) -> None:
+        """Send the pixels that make no full message."""
+        if self._unsent[thread]:
+            self._cluster.show(self._number, self.rank, self._unsent[thread])
+            self._unsent[thread] = 0
