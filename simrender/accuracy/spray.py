@@ -1,8 +1,10 @@
 """Comparison with runs of the SpRay program: what it counted, and what the schedulers here count on the scene.
 
-Park, Fussell and Navratil's program is public (TACC/SpRay). A table of its runs has a row a run: which program, how many
-ranks, which shading, cache and partition, and its counters. With one point light and one bounce nothing is random, so
-counts agree up to rays that graze; else the random directions differ, and counts agree to a few percent.
+Park, Fussell and Navratil's program is public (TACC/SpRay). A table of its runs has a row a run: which program, how
+many ranks, which shading, cache and partition, and its counters. Its random numbers are drawn here too
+(`integrators.SprayPathTracing.program_image`), so counts agree up to rays that graze. A few of those can turn the order
+of two domains with nearly as many rays, and with it every count that follows: where directions are random, that makes
+loads differ by a percent or two.
 """
 
 from __future__ import annotations

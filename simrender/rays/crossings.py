@@ -13,7 +13,7 @@ first      i8    first row of each ray, then the number of rows
 domain     i2    of each row
 entry      f4    distance at which the ray enters the domain's box, 0 if it starts inside
 hit        f4    nearest hit in the domain; NaN unknown, infinite for none
-work       u4    through volumes: samples, look-ups or elements; 0 where unknown
+work       u2    through volumes: samples, look-ups or elements, at most 65,535; 0 where unknown
 ray        i8    id of each ray, ascending; only in the table of occluded shadow rays
 ========== ===== ===================================================================
 """
@@ -157,14 +157,7 @@ class Crossings:
             local = np.flatnonzero((trace.column("kind")[begin:end] == SHADOW) & np.isfinite(t))
             geometry = tuple(column[local] for column in geometry)
             t, primitive = t[local], primitive[local]
-        # Boxes as they are: a hit that float32 lets lie outside its box is the nearest one, or does not matter.
-        if domains.planes is not None:
-            entered = walk_grid(*geometry, domains.planes, growth=0.0)
-        else:
-            entered = enter_boxes(*geometry, domains.low, domains.high, growth=0.0)
-        first, domain, entry = entered.first, entered.domain, entered.entry
-        _leave_first(first, domain, entry, geometry[0], geometry[1], domains.low, domains.high)
-        del entered  # where rows are added, the old ones need not stay
+        first, domain, entry = enter_domains(domains, *geometry)
         nearest = None
         if domains.domain_of_triangle is not None:
             nearest = np.where(primitive >= 0, domains.domain_of_triangle[primitive], -1).astype(np.int16)
@@ -172,7 +165,7 @@ class Crossings:
         hit = np.full(len(domain), np.nan, np.float32)
         table = {"first": first, "domain": domain, "entry": entry, "hit": hit}
         if self._work:
-            table["work"] = np.zeros(len(hit), np.uint32)
+            table["work"] = np.zeros(len(hit), np.uint16)
         elif nearest is not None:
             embree.in_chunks(
                 lambda some: _fill_known(first[some.start : some.stop + 1], domain, nearest[some], t[some], hit), len(t)
@@ -187,9 +180,22 @@ class Crossings:
         rays = self.trace.geometry(generation)
         found = self.trace.world.cross(rays, ray, self.domains, table["domain"][rows], self.trace.seed)
         for name in ("hit", *self._work):
-            table[name][rows] = found[name]
+            table[name][rows] = found[name] if name == "hit" else np.minimum(found[name], np.iinfo(np.uint16).max)
         self.asked_rows += len(rows)
         self._changed.add(f"{generation:03d}-{which}-{self.domains.key}")
+
+
+def enter_domains(
+    domains: Domains, origin: NDArray[np.float32], direction: NDArray[np.float32], reach: NDArray[np.float32]
+) -> tuple[Ids, NDArray[np.int16], NDArray[np.float32]]:
+    """Return the rows of some rays: ``first``, ``domain`` and ``entry`` as in the crossing table."""
+    # Boxes as they are: a hit that float32 lets lie outside its box is the nearest one, or does not matter.
+    if domains.planes is not None:
+        entered = walk_grid(origin, direction, reach, domains.planes, growth=0.0)
+    else:
+        entered = enter_boxes(origin, direction, reach, domains.low, domains.high, growth=0.0)
+    _leave_first(entered.first, entered.domain, entered.entry, origin, direction, domains.low, domains.high)
+    return entered.first, entered.domain, entered.entry
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
