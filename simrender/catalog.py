@@ -135,9 +135,10 @@ class CardFile:
             got = "nothing" if reference is None else repr(reference)
             raise UsageError(f"expected the name or the path of a card, got {got}")
         base, _ = _split(reference, self.path.parent)
-        for other in _SECTIONS if kind else ():
-            if other != kind and not looks_like_a_path(base, self.path.parent) and base in cards(other):
-                raise UsageError(f"{base!r} is a {other}, expected a {kind}")
+        if kind and not looks_like_a_path(base, self.path.parent) and base not in cards(kind):
+            for other in _SECTIONS:
+                if other != kind and base in cards(other):
+                    raise UsageError(f"{base!r} is a {other}, expected a {kind}")
         parent = find_card(kind, reference, self.path.parent)
         places = [child.path.resolve() for child in children]
         if parent.path.resolve() in places:

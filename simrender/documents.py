@@ -403,8 +403,8 @@ def _lay(upper: dict[str, Any], lower: dict[str, Any], path: Path, replaced: set
             _lay(value, below, here, replaced)
             continue
         replaced.add(here)
-        if value is None:
-            lower.pop(name, None)
+        if value is None and name in lower:
+            del lower[name]
         else:
             lower[name] = copy.deepcopy(value)
 

@@ -47,7 +47,7 @@ def test_unknown_names_say_what_is_near(bad, tiny_card):
 
 def test_unknown_words_of_the_command_line(bad, tiny_card):
     assert (
-        bad("rnu") == 'Unknown command "rnu". Did you mean "run"? Available commands: list, show, trace, run, network.'
+        bad("rnu") == 'Unknown command "rnu". Did you mean "run"? Available commands: list, show, trace, run, compare, network.'
     )
     assert bad("list", "machine").endswith('Did you mean "machines"?')
     assert bad("run", "dgx2", tiny_card, "--polcy", "x") == "Unknown option: --polcy. Did you mean --policy?"
@@ -294,7 +294,7 @@ def test_a_trace_has_no_machine(bad, tiny_card):
         ("--islands", 2.0, "--islands 2.0: expected a number of islands, or auto"),
         ("--seed", -1, "--seed -1: expected a number from 0 to 2^64 - 1"),
         ("--seed", 1.5, "--seed 1.5: expected a whole number"),
-        ("--seed", 10**30, f"--seed {10**30}: expected a whole number of up to 18 digits"),
+        ("--seed", 10**30, f"--seed {10**30}: expected a whole number of up to 20 digits"),
     ],
 )
 def test_a_bad_count(bad, tiny_card, option, value, message):

@@ -8,6 +8,7 @@ distance, as is often done. `far_cameras` moves the camera instead, and `escapes
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 
 from simrender.accuracy.furnace import ball
 from simrender.accuracy.partitions import bundle, generator, nearest
+from simrender.errors import SceneWarning
 from simrender.rays import embree
 from simrender.rays.integrators import PathTracing
 from simrender.rays.sampling import offset_origin
@@ -181,7 +183,9 @@ class _Room:
         vertices = size * (self.vertices + offset * ANYWHERE)
         thing = SceneObject("room", (Mesh(vertices.astype(np.float32), self.faces),))
         scene = Scene((thing,), np.zeros(1, np.int32), IDENTITY[None])
-        trace = Trace(scene, np.eye(4, 3), (1, 1), 1, PathTracing())
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", SceneWarning)  # what they warn of is what is measured here
+            trace = Trace(scene, np.eye(4, 3), (1, 1), 1, PathTracing())
         rows = []
         for scheme in SCHEMES:
             factor = trace.factor if scheme == SCHEMES[0] else 1.0

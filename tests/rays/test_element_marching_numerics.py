@@ -269,7 +269,7 @@ def test_samples_lie_no_further_apart_than_the_step():
 
 @pytest.mark.parametrize("step", [0.0, -1.0, np.nan])
 def test_a_step_that_leads_nowhere_is_refused(step):
-    with pytest.raises(SceneError, match="the step of a ray march is a length above 0, got"):
+    with pytest.raises(SceneError, match="the step of a ray march is a length above"):
         march(cube("hexahedra"), rays([-1, 0.5, 0.4], [0, 0.5, 0.4]), step=step)
 
 
