@@ -36,7 +36,9 @@ def place(card: MachineCard, domains: Domains, policy: DomainPolicy, ranks: int,
         if policy.in_situ:
             given = policy.owners is not None and size == ranks // count
             owner = owners(policy, domains, size) if given else morton_ranks(domains.low, domains.high, size)
-            return np.tile(np.bincount(owner, sizes, minlength=size), count)
+            held = np.bincount(owner, sizes, minlength=size)
+            copies = min(getattr(policy, "copies", 1), size)
+            return np.tile(np.sum([np.roll(held, k) for k in range(copies)], axis=0), count)
         # A slot of the cache is as large as the largest domain.
         return np.full(count * size, cache_capacity(policy.cache, domains.count) * float(sizes.max()))
 
@@ -85,7 +87,7 @@ def render(
     devices = Machine(env, card, layout.ranks, record=True)
     names = [devices.processor(index).name for index in range(layout.ranks)]
     timeline = Timeline(layout.ranks, names)
-    together = layout.ranks if not policy.in_situ and getattr(policy, "data", "") == "out_of_core" else layout.size
+    together = layout.size if policy.in_situ else layout.ranks
     frames = [
         _frame(env, devices, crossings, policy, timeline, workload, island, together)
         for island in range(layout.ranks // together)
@@ -102,10 +104,11 @@ def render(
         raise InvariantError(f"{facts['policy']} rendered another image than the reference renderer")
     weight = frames[0].weight
     counted = [dataclasses.asdict(f.counters) for f in frames]
-    counters = {name: sum(c[name] for c in counted) for name in counted[0]}
+    counters = {name: sum(c[name] for c in counted) for name in counted[0] if name != "rounds"}
+    counters["rounds"] = max(c["rounds"] for c in counted)
     counters["critical_tests"] = _critical_tests([event for f in frames for event in f.events])
-    ray_bytes = getattr(policy, "ray_bytes", RAY_BYTES)
-    peak = max(max(f.peak_rays) for f in frames) * weight * ray_bytes
+    ray_bytes = getattr(policy, "ray_bytes", None) or RAY_BYTES
+    peak = max(max(f.peak_bytes) or max(f.peak_rays) * weight * ray_bytes for f in frames)
     memory = facts["memory"] | {"peak_rays_bytes": peak, "needed_bytes": facts["memory"]["needed_bytes"] + peak}
     carried = links(devices)
     loads = devices.network.loads_by_link if devices.has_network else {}

@@ -21,7 +21,7 @@ from pydantic import ConfigDict, Field
 from simrender.clock import to_ticks
 from simrender.hardware.cache import MISS, NODE_BLOCK_BYTES, TRIANGLE_BLOCK_BYTES, BlockMap, DirectMappedCache
 from simrender.hardware.display import Display, message_layout
-from simrender.hardware.machine import Machine
+from simrender.hardware.machine import Machine, MachineCard
 from simrender.hardware.storage import BlockFetcher
 from simrender.policies.tiles import TiledFrame
 from simrender.rays.blocks import PACKET_RAYS
@@ -43,7 +43,8 @@ class DistributedCache:
     ----------
     cache : str
         What a node keeps of the data, its own blocks and the cache together, as in the paper's 1/N: a share such as
-        ``12.5%``, a size such as ``2 GiB`` of the published data, or ``all``.
+        ``12.5%``, or a size such as ``2 GiB`` of the published data. Or ``all``: data that are replicated before the
+        first frame, and nothing to fetch.
     mapping : "ize" or "demarle"
         Which line of the cache a block has; see `simrender.hardware.cache.BlockMap`.
     threads : int, optional
@@ -65,7 +66,8 @@ class DistributedCache:
     display : bool, optional
         Whether pixels go to the machine's display; by default if it has one.
     warm_up : int
-        How often the first frame is rendered before frames count.
+        How often the first frame is rendered before frames count; the first that does begins when these are complete.
+        Tiles that are dealt come to another node each time, so caches take many frames to settle.
 
     """
 
@@ -81,6 +83,15 @@ class DistributedCache:
     fetches: Literal["grouped", "single"] = "grouped"
     display: bool | None = None
     warm_up: Annotated[int, Field(ge=0)] = 1
+
+    @property
+    def replicated(self) -> bool:
+        """Whether every node has all data."""
+        return self.cache == "all"
+
+    def render_threads(self, card: MachineCard) -> int:
+        """Return how many threads of a node render."""
+        return int(getattr(card.processor, "cores", 1)) if self.threads is None else self.threads
 
     def node(self, me: RenderNode) -> Steps:
         """Render all frames on one node."""
@@ -176,7 +187,7 @@ class Cluster:
     frames : list of TiledFrame
         One after the other; those to warm up are among them.
     lines : (int, int)
-        Lines of a node's cache of blocks of nodes, and of triangles.
+        Lines of a node's cache of blocks of nodes, and of triangles; where data are replicated there are none.
     display : Display or None
 
     """
@@ -192,10 +203,11 @@ class Cluster:
     ) -> None:
         self.env, self.machine, self.policy, self.frames, self.display = env, machine, policy, frames, display
         self.ranks = self.master = machine.nodes - 1
-        self.threads = policy.threads or getattr(machine.card.processor, "cores", 1)
+        self.threads = policy.render_threads(machine.card)
+        owners = 1 if policy.replicated else self.ranks
         self.maps = (
-            BlockMap(self.ranks, lines[0], policy.mapping),
-            BlockMap(self.ranks, lines[1], policy.mapping, root=None),
+            BlockMap(owners, lines[0], policy.mapping),
+            BlockMap(owners, lines[1], policy.mapping, root=None),
         )
         names = [f"node{rank}.thread{k}" for rank in range(self.ranks) for k in range(self.threads)]
         self.timeline = Timeline(len(names), names)
@@ -203,6 +215,9 @@ class Cluster:
         self._complete = [env.event() for _ in frames]
         self._running = [self.ranks] * len(frames)
         self._dealt = [self.begins_with(frame, self.ranks).start for frame in frames]
+        if display is not None:
+            for frame in range(len(frames)):
+                display.complete(frame).callbacks.append(partial(self._shown, frame))
 
     def begins_with(self, frame: TiledFrame, rank: int) -> range:
         """Return the tiles that a node begins a frame with; those from that of the first rank too many on are dealt."""
@@ -220,9 +235,10 @@ class Cluster:
 
     def may_begin(self, frame: int) -> simpy.Event:
         """Return what happens when a frame may begin: the display has room, or the one before is rendered."""
-        if self.display is not None:
-            return self.display.may_send(frame)
-        return self._complete[frame - 1] if frame else self.env.timeout(0)
+        if self.display is None:
+            return self._complete[frame - 1] if frame else self.env.timeout(0)
+        measured = 0 < frame == self.policy.warm_up
+        return self.display.complete(frame - 1) if measured else self.display.may_send(frame)
 
     def finish(self, frame: int) -> None:
         """Learn that a node has rendered its part of a frame."""
@@ -243,9 +259,7 @@ class Cluster:
     def _arrive(self, frame: int, pixels: int, sent: simpy.Event) -> None:
         assert self.display is not None  # noqa: S101 - see above
         if sent.ok:
-            done = self.display.deliver(frame, pixels)
-            if done.callbacks is not None and not done.callbacks:
-                done.callbacks.append(partial(self._shown, frame))
+            self.display.deliver(frame, pixels)
 
     def _shown(self, frame: int, _: simpy.Event) -> None:
         self.counts[frame].complete_at = int(self.env.now)
@@ -264,7 +278,7 @@ class RenderNode:
         self._cluster, self.rank = cluster, rank
         self.threads, self.frames = cluster.threads, len(cluster.frames)
         self._slowness = cluster.machine.processor(rank).slowness
-        self._caches = [DirectMappedCache(blocks, rank) for blocks in cluster.maps]
+        self._caches = [DirectMappedCache(blocks, rank % blocks.ranks) for blocks in cluster.maps]
         self._queue: deque[int] = deque()
         self._taken = 0  # published pixels of the first packet in the queue
         self._asking: simpy.Event | None = None
@@ -272,7 +286,7 @@ class RenderNode:
         self._number = -1
         self._seen = (0, 0, 0)
         self._fetchers = []
-        if cluster.policy.fetches == "single":
+        if cluster.policy.fetches == "single" and not cluster.policy.replicated:
             hosts = [("host", r) for r in range(cluster.ranks)]
             sizes = (NODE_BLOCK_BYTES, TRIANGLE_BLOCK_BYTES)
             self._fetchers = [
@@ -324,7 +338,7 @@ class RenderNode:
             size, due = int(frame.pixels[packet]), int(self._gets[packet])
             some = min(left, size - begin)
             seconds += float(frame.seconds[packet]) * (some / size if size else 1.0)
-            if due:
+            if due and size:
                 issued = due * begin // size
                 new = due * (begin + some) // size - issued
                 if new and not gets:
@@ -366,7 +380,7 @@ class RenderNode:
         begin, end = int(frame.first[tile]), int(frame.first[tile + 1])
         self._counts.tiles += 1
         self._queue.extend(range(begin, end))
-        if self._fetchers or self._cluster.ranks == 1:
+        if self._fetchers:
             return
         owners, packet_of = [], []
         for cache, stream, nbytes in zip(

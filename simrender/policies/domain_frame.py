@@ -68,6 +68,14 @@ class Counters:
         As published.
     critical_tests : int
         Sum over the steps of the busiest rank's tests.
+    rounds : int
+        Of a schedule that speculates; of the busiest rank, where each has its own.
+    radiance_queued, shadow_queued, radiance_filtered, shadow_filtered : int
+        Entries of (ray, domain) in queues that speculate, and those dropped before they were tested.
+    rejected_hits, spilled_rays, wrong_rays : int
+        Hits behind one that was known; rays that waited for the history buffer; rays that wrong hits spawned.
+    tbuf_bytes, obuf_bytes : float
+        Of the distance and occlusion buffers that ranks combined, each counted once a time, as published.
 
     """
 
@@ -81,6 +89,16 @@ class Counters:
     sent_rays: int = 0
     sent_bytes: float = 0.0
     critical_tests: int = 0
+    rounds: int = 0
+    radiance_queued: int = 0
+    shadow_queued: int = 0
+    radiance_filtered: int = 0
+    shadow_filtered: int = 0
+    rejected_hits: int = 0
+    spilled_rays: int = 0
+    wrong_rays: int = 0
+    tbuf_bytes: float = 0.0
+    obuf_bytes: float = 0.0
 
 
 EXPLAINED = 12
@@ -176,6 +194,7 @@ class DomainFrame:
     shared: dict[tuple[int, int], tuple[Any, int]] = field(default_factory=dict)
     tests_of_step: dict[int, dict[int, int]] = field(default_factory=dict)
     peak_rays: list[int] = field(default_factory=list)
+    peak_bytes: list[float] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         trace = self.crossings.trace
@@ -186,6 +205,8 @@ class DomainFrame:
         self.position = self.visits.first[:-1].copy()
         """The next visit of each ray."""
         self.peak_rays = [0] * self.ranks
+        self.peak_bytes = [0.0] * self.ranks
+        """What a rank's rays, queues and buffers took at most, as published, where the policy counts it."""
         if self.owner is not None:
             self.owned_by_rank = [np.flatnonzero(self.owner == rank) for rank in range(self.ranks)]
 

@@ -47,6 +47,8 @@ class DomainRank:
     index : int
     ranks : int
         How many there are.
+    weight : float
+        Published rays for which a traced ray stands.
     queues : DomainQueues
         Its ray batch queues.
     owned : int64 array
@@ -56,7 +58,7 @@ class DomainRank:
 
     def __init__(self, frame: DomainFrame, index: int) -> None:
         self._frame, self.index, self.ranks = frame, index, frame.ranks
-        self.device = frame.first_rank + index
+        self.device, self.weight = frame.first_rank + index, frame.weight
         self._processor = frame.machine.processor(self.device)
         self.queues = DomainQueues(frame.domains.count)
         self.cache = frame.caches[index]
@@ -69,6 +71,11 @@ class DomainRank:
             self.owned_by_rank = frame.owned_by_rank
         self.step = 0
         self._collectives = self._asked = 0
+
+    @property
+    def frame(self) -> DomainFrame:
+        """What all ranks share."""
+        return self._frame
 
     # -- rays -----------------------------------------------------------------------------------------------------
 
@@ -142,6 +149,14 @@ class DomainRank:
         frame.counters.shadow_tests += shadow
         frame.counters.radiance_tests += len(asking) - shadow
         self._tests[0] += len(asking) - shadow
+        self._tests[1] += shadow
+
+    def query(self, domain: int, camera: int, radiance: int, shadow: int) -> Steps:
+        """Query a domain for so many radiance rays, ``camera`` of them camera rays, and so many shadow rays."""
+        yield from self.compute(domain, camera, radiance - camera + shadow)
+        self._frame.counters.radiance_tests += radiance
+        self._frame.counters.shadow_tests += shadow
+        self._tests[0] += radiance
         self._tests[1] += shadow
 
     def compute(self, domain: int, coherent: float, incoherent: float) -> Steps:
@@ -229,6 +244,32 @@ class DomainRank:
         frame.counters.sent_rays += len(rays)
         frame.counters.sent_bytes += nbytes * frame.weight
         return self.comm.isend(target, nbytes * frame.weight, tag)
+
+    def post(self, target: int, rays: int, tag: int, nbytes: float, header: float = 0.0) -> simpy.Event:
+        """Send so many rays, which take ``nbytes`` and a header; done when they have left."""
+        counters, nbytes = self._frame.counters, nbytes * self._frame.weight + header
+        assert self.comm is not None  # noqa: S101 - there is another rank
+        counters.messages += 1
+        counters.sent_rays += rays
+        counters.sent_bytes += nbytes
+        return self.comm.isend(target, nbytes, tag)
+
+    def collect(self, messages: int, rays: int) -> Steps:
+        """Wait for so many messages with so many rays."""
+        frame, begin = self._frame, int(self._frame.env.now)
+        for _ in range(messages):
+            assert self.comm is not None  # noqa: S101 - there is another rank
+            yield self.comm.irecv()
+        if messages:
+            frame.timeline.add(self.device, COPY, begin, int(frame.env.now), 0.0, rays * frame.weight)
+
+    def combine(self, nbytes: float) -> Steps:
+        """Combine a buffer of all ranks, element by element."""
+        frame, begin = self._frame, int(self._frame.env.now)
+        if self.comm is not None:
+            self._collectives, self._asked = self._collectives + 1, 0
+            yield self.comm.allreduce(nbytes)
+            frame.timeline.add(self.device, SYNC, begin, int(frame.env.now), 0.0, 0.0)
 
     def receive(self, rays: int, tag: int | None = None) -> Steps:
         """Wait for messages, those with a tag if one is given, until so many rays have come; return them."""

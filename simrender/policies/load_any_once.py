@@ -2,8 +2,8 @@
 
 Pharr et al., "Rendering complex scenes with memory-coherent ray tracing" (1997), out of core; Navratil et al.,
 "Exploring the spectrum of dynamic scheduling algorithms for scalable distributed-memory ray tracing" (2014), over
-ranks; both as Park, Fussell and Navratil, "SpRay: speculative ray scheduling for large data visualization" (2018), section 3
-and listing 1, have them for their baselines.
+ranks; both as Park, Fussell and Navratil, "SpRay: speculative ray scheduling for large data visualization" (2018),
+section 3 and listing 1, have them for their baselines.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from simrender.policies.domain_frame import Steps
 from simrender.policies.domain_rank import DomainRank
 from simrender.policies.queues import fullest
 from simrender.policies.rounds import rounds, visit_all
+from simrender.policies.std_sort import descending
 
 
 @dataclass(frozen=True)
@@ -42,6 +43,9 @@ class LoadAnyOnce:
         Cores of a rank that trace; all by default. The paper's in situ renderers use one.
     owners : tuple of int, optional
         The rank of each domain in situ; blocks in Morton order by default.
+    like_program : bool
+        Out of core, of domains with equally many rays take the one that the C++ library sorts first, as the authors'
+        program does, and not the lowest.
 
     """
 
@@ -53,6 +57,7 @@ class LoadAnyOnce:
     ray_bytes: Annotated[float, Field(gt=0)] = 96.0
     threads: Annotated[int, Field(ge=1)] | None = None
     owners: tuple[int, ...] | None = None
+    like_program: bool = False
 
     @property
     def in_situ(self) -> bool:
@@ -71,6 +76,8 @@ class LoadAnyOnce:
     def choose(self, me: DomainRank) -> int | None:
         """Choose a domain with most rays (listing 1, line 2)."""
         cached = fullest(me.queues.counts, me.cache.resident) if self.prefer_cached else None
+        if cached is None and self.like_program and me.queues.any():
+            return descending(me.queues.counts)[0]
         return fullest(me.queues.counts) if cached is None else cached
 
     def schedule(self, me: DomainRank, waiting: NDArray[np.int64]) -> dict[int, int]:

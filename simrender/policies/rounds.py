@@ -110,9 +110,10 @@ def deliver(me: DomainRank, holder: Sequence[int] | NDArray[np.int64], ray_bytes
     for rank, parts in parcels.items():
         going[rank] = sum(map(len, parts))
     coming = yield from me.tell_each(going, 8.0)
-    leaving = []
-    for rank in sorted(parcels):
-        leaving.append(me.send(rank, np.concatenate(parcels[rank]), RADIANCE, float(going[rank]) * ray_bytes))
+    leaving = [
+        me.send(rank, np.concatenate(parcels[rank]), RADIANCE, float(going[rank]) * ray_bytes)
+        for rank in sorted(parcels)
+    ]
     me.enqueue((yield from me.receive(int(coming.sum()), RADIANCE)))
     for event in leaving:  # noqa: UP028 - SimPy's events are no generators
         yield event

@@ -37,6 +37,7 @@ PACKET_RAYS: Final = PACKET_SIDE**2
 """A packet has 64 rays (section 5.2): those of a square of pixels."""
 
 _BINS, _MAX_LEAF, _DEEP = 16, 8, 64
+_FULL_LEVELS = 2
 _STACK = 2 * _DEEP
 _CHUNK = 256
 """Packets that a thread takes at once."""
@@ -48,8 +49,8 @@ class Blocks:
 
     The first block begins with the root, alone in the place of a pair. A block is filled breadth first, by pairs of
     children, from the root of a subtree; each pair that it has no room for then begins a subtree of its own, depth
-    first. A subtree that ends before its block is full is followed by the next one without a gap, so that a block may
-    hold several, and a pair never lies in two blocks. Triangles lie in the order in which a traversal of all leaves
+    first. A subtree that ends before its block is full is followed by the next one without a gap (but where larger
+    blocks begin), so that a block may hold several, and a pair never lies in two blocks. Triangles lie in the order in which a traversal of all leaves
     meets them.
 
     Attributes
@@ -60,27 +61,29 @@ class Blocks:
         The first of two children, or the first triangle of a leaf.
     count : int32 array (nodes,)
         Triangles of a leaf; of an inner node -1, -2 or -3 for children apart along x, y or z.
+    block : int32 array (nodes,)
+        The block of each node, ascending from 0.
     triangles : float32 array (triangles, 9)
         Three corners each.
     ids : int32 array (triangles,)
         The row of each in the faces they were built from.
-    node_block, triangle_block : int
-        How many lie in a block.
+    triangle_block : int
+        Triangles of a block.
 
     """
 
     bounds: F32
     link: I32
     count: I32
+    block: I32
     triangles: F32
     ids: I32
-    node_block: int = NODE_BLOCK
     triangle_block: int = TRIANGLE_BLOCK
 
     @property
     def node_blocks(self) -> int:
         """Blocks of nodes; the last one need not be full."""
-        return -(-len(self.link) // self.node_block)
+        return int(self.block[-1]) + 1
 
     @property
     def triangle_blocks(self) -> int:
@@ -117,8 +120,8 @@ class References:
     """The blocks that a frame's rays refer to, by packet of pixels.
 
     A packet is a square of 8 x 8 pixels, smaller at the right and lower edges, row-major from the top left, with all
-    rays that descend from its camera rays. These go in ray packets of at most 64: camera rays of one sample, and at each
-    later generation the rays of one kind that are their parents' k-th children.
+    rays that descend from its camera rays. These go in ray packets of at most 64: camera rays of one sample, and at
+    each later generation the rays of one kind that are their parents' k-th children.
 
     Attributes
     ----------
@@ -158,7 +161,8 @@ def block_hierarchy(
     vertices : float32 array (v, 3)
     faces : int32 array (t, 3), t > 0
     node_block : int
-        Nodes of a block: even, at least 2.
+        Nodes of a block: even, at least 2. Smaller blocks than `NODE_BLOCK` begin with the third block on the way from
+        the root: those above are few in a mesh of any size, and every ray needs some of them.
     triangle_block : int
         Triangles of a block, at least 1.
 
@@ -178,21 +182,22 @@ def block_hierarchy(
     corners = vertices[faces]
     order = np.arange(len(faces), dtype=np.int32)
     bounds, link, count = _build(corners.min(axis=1), corners.max(axis=1), order)
-    place, size = _lay_out(link, count, node_block)
+    place, block = _lay_out(link, count, node_block, max(node_block, NODE_BLOCK), _FULL_LEVELS)
     bounds = np.stack([np.nextafter(bounds[:, :3], -np.inf), np.nextafter(bounds[:, 3:], np.inf)], 1).reshape(-1, 6)
+    size = len(block)
     laid = np.zeros((size, 6), np.float32), np.zeros(size, np.int32), np.zeros(size, np.int32)
     laid[0][place] = bounds
     laid[1][place] = np.where(count < 0, place[np.where(count < 0, link, 0)], link)
     laid[2][place] = count
-    return Blocks(*laid, np.ascontiguousarray(corners[order].reshape(-1, 9)), order, node_block, triangle_block)
+    return Blocks(*laid, block, np.ascontiguousarray(corners[order].reshape(-1, 9)), order, triangle_block)
 
 
 def walk(blocks: Blocks, first: I64, origin: F32, direction: F32, reach: F32, shadow: NDArray[np.bool_]) -> Walk:
     """Take packets of rays through a hierarchy, on all cores.
 
     A packet goes on as long as one of its rays meets a node's box nearer than that ray's nearest hit, the child first
-    that is nearer to the first such ray (Wald, Boulos and Shirley, "Ray tracing deformable scenes using dynamic bounding
-    volume hierarchies", 2007). Shadow rays stop at any hit.
+    that is nearer to the first such ray (Wald, Boulos and Shirley, "Ray tracing deformable scenes using dynamic
+    bounding volume hierarchies", 2007). Shadow rays stop at any hit.
 
     Parameters
     ----------
@@ -209,7 +214,7 @@ def walk(blocks: Blocks, first: I64, origin: F32, direction: F32, reach: F32, sh
     def go(begin: int) -> tuple[I64, I32]:
         found: tuple[I64, I32] = _walk(
             first[begin : begin + _CHUNK + 1], origin, direction, reach, shadow, blocks.bounds, blocks.link,
-            blocks.count, blocks.triangles, blocks.ids, blocks.node_block, blocks.triangle_block, t, primitive,
+            blocks.count, blocks.block, blocks.triangles, blocks.ids, blocks.triangle_block, t, primitive,
         )  # fmt: skip
         return found
 
@@ -396,7 +401,7 @@ def _build(low, high, order):  # type: ignore[no-untyped-def]
                 for b in range(1, _BINS):
                     before += size[b - 1]
                     _grow(run, box[b - 1])
-                    if before == 0 or before == total:
+                    if before in {0, total}:
                         continue
                     cost = before * _area(run) + right[b]
                     if cost < best:
@@ -440,46 +445,51 @@ def _area(box):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _lay_out(link, count, room_of_block):  # type: ignore[no-untyped-def]
-    """Return the place of each node in memory, and how many places there are: the one after the root stays empty."""
+def _lay_out(link, count, small, full, full_levels):  # type: ignore[no-untyped-def]
+    """Return the place of each node in memory, and the block of each place: the one after the root stays empty."""
     n = len(link)
-    place = np.empty(n, np.int64)
-    waiting = np.empty(n // 2 + 2, np.int64)
-    queue = np.empty(room_of_block + 4, np.int64)
+    place, block = np.empty(n, np.int64), np.empty(n + 1, np.int32)
+    waiting = np.empty((n // 2 + 2, 2), np.int64)
+    queue = np.empty(full + 4, np.int64)
     place[0] = 0
-    used, top = 2, 0
+    block[:2] = 0
+    used, size, room, here, top = 2, full, full - 2, 0, 0
     if count[0] < 0:
-        waiting[0] = link[0]
+        waiting[0, 0], waiting[0, 1] = link[0], 0
         top = 1
     while top:
         top -= 1
-        queue[0] = waiting[top]
+        queue[0], level = waiting[top]
         head, tail = 0, 1
-        room = room_of_block - used % room_of_block
+        wanted = full if level < full_levels else small
+        if room == 0 or wanted > size:
+            here += 1
+            size = room = wanted
         while head < tail and room:
             pair = queue[head]
             head += 1
             for node in (pair, pair + 1):
                 place[node] = used
+                block[used] = here
                 used += 1
                 if count[node] < 0:
                     queue[tail] = link[node]
                     tail += 1
             room -= 2
         for i in range(tail - 1, head - 1, -1):
-            waiting[top] = queue[i]
+            waiting[top, 0], waiting[top, 1] = queue[i], level + 1
             top += 1
-    return place, used
+    return place, block[:used].copy()
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _walk(first, origin, direction, reach, shadow, bounds, link, count, triangles, ids, nodes, tris, t, primitive):  # type: ignore[no-untyped-def]
+def _walk(first, origin, direction, reach, shadow, bounds, link, count, home, triangles, ids, tris, t, primitive):  # type: ignore[no-untyped-def]
     """Take some packets through a hierarchy; return how many references each makes, and these."""
     packets = len(first) - 1
     length = np.zeros(packets, np.int64)
     out = np.empty(4096, np.int32)
     used = 0
-    base = -(-len(link) // nodes)
+    base = home[-1] + 1
     stack = np.empty((_STACK + 128, 2), np.int64)
     inverse = np.empty((64, 3), np.float64)
     far = np.empty(64, np.float64)
@@ -504,8 +514,8 @@ def _walk(first, origin, direction, reach, shadow, bounds, link, count, triangle
                 bigger = np.empty(2 * len(out), np.int32)
                 bigger[:used] = out[:used]
                 out = bigger
-            if node // nodes != node_here:
-                node_here = node // nodes
+            if home[node] != node_here:
+                node_here = home[node]
                 out[used] = node_here
                 used += 1
             while active < n and not _meets(bounds, node, origin, begin + active, inverse, far, active):

@@ -60,6 +60,7 @@ class Crossings:
         self.asked_rows = 0
         self._tables: dict[str, Columns] = {}
         self._changed: set[str] = set()
+        self.tree: Any = None  # of rays, once somebody asks for it: `speculative.ray_tree`
 
     # -- every ray ------------------------------------------------------------------------------------------------
 

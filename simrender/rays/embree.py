@@ -62,7 +62,7 @@ class Geometry:
         from embreex.mesh_construction import TriangleMesh
         from embreex.rtcore_scene import EmbreeScene
 
-        self._scene = EmbreeScene(robust=True)
+        self._scene = EmbreeScene(_device(), robust=True)
         TriangleMesh(self._scene, vertices, faces)
         # The hierarchy is built by the first query, which must not happen in two threads at once.
         self._scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32), query="OCCLUDED")
@@ -109,6 +109,14 @@ def on_all_cores(work: Callable[[A], B], items: Iterable[A]) -> list[B]:
 def chunks(n: int) -> list[slice]:
     """Cut ``range(n)`` into slices of `CHUNK`."""
     return [slice(start, min(start + CHUNK, n)) for start in range(0, n, CHUNK)]
+
+
+@cache
+def _device() -> Any:
+    """Return the device of all scenes: with one each, Embree crashes at a thousand."""
+    from embreex.rtcore import EmbreeDevice
+
+    return EmbreeDevice()
 
 
 @cache

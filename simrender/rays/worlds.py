@@ -117,6 +117,7 @@ class SurfaceWorld:
             raise SceneError("the scene has no triangles; its volume needs volume_marching or volume_path_tracing")
         self.scene, self.integrator = scene, integrator
         self._domains: dict[tuple[str, int], embree.Geometry] = {}
+        self._triangles: dict[str, tuple[Ids, Ids]] = {}
 
     @cached_property
     def surfaces(self) -> Surfaces:
@@ -168,20 +169,50 @@ class SurfaceWorld:
     def cross(self, rays: Columns, ray: Ids, domains: Domains, domain: NDArray[np.int16], seed: int) -> Columns:  # noqa: ARG002
         """See `World`."""
         hit = np.full(len(ray), np.inf, np.float32)
+        for _, rows, hits in self._queries(rays, ray, domains, domain):
+            hit[rows] = hits.t
+        return {"hit": hit}
+
+    def domain_hits(self, rays: Columns, ray: Ids, domains: Domains, domain: NDArray[np.int16]) -> embree.Hits:
+        """Return the hits of `cross` in full, with global triangle ids."""
+        n = len(ray)
+        found = embree.Hits(
+            np.full(n, np.inf, np.float32), np.full(n, -1, np.int32), np.zeros(n, np.float32), np.zeros(n, np.float32)
+        )
+        for d, rows, hits in self._queries(rays, ray, domains, domain):
+            found.t[rows], found.u[rows], found.v[rows] = hits.t, hits.u, hits.v
+            # A domain's triangles are those of the scene that lie in it, in their order.
+            triangles = self._triangles_of(domains, d)
+            found.primitive[rows] = np.where(hits.primitive >= 0, triangles[hits.primitive], -1)
+        return found
+
+    def _queries(
+        self, rays: Columns, ray: Ids, domains: Domains, domain: NDArray[np.int16]
+    ) -> Iterator[tuple[int, Ids, embree.Hits]]:
+        """Yield domains, rows, and what these hit there; domains without triangles are left out."""
         jobs = []
         for d, rows in by_domain(domain):
             geometry = self.domain_geometry(domains, d)
             if geometry is not None:
-                jobs += [(geometry, rows[part]) for part in embree.chunks(len(rows))]
+                jobs += [(d, geometry, rows[part]) for part in embree.chunks(len(rows))]
 
-        def work(job: tuple[embree.Geometry, Ids]) -> NDArray[np.float32]:
-            geometry, rows = job
+        def work(job: tuple[int, embree.Geometry, Ids]) -> embree.Hits:
+            _, geometry, rows = job
             r = ray[rows]
-            return geometry.nearest(rays["origin"][r], rays["direction"][r], rays["reach"][r]).t
+            return geometry.nearest(rays["origin"][r], rays["direction"][r], rays["reach"][r])
 
-        for (_, rows), t in zip(jobs, embree.on_all_cores(work, jobs), strict=True):
-            hit[rows] = t
-        return {"hit": hit}
+        for (d, _, rows), hits in zip(jobs, embree.on_all_cores(work, jobs), strict=True):
+            yield d, rows, hits
+
+    def _triangles_of(self, domains: Domains, domain: int) -> Ids:
+        """Return the ids of a domain's triangles, ascending."""
+        if domains.key not in self._triangles:
+            assert domains.domain_of_triangle is not None  # noqa: S101 - the caller looked
+            order = np.argsort(domains.domain_of_triangle, kind="stable")
+            bounds = np.searchsorted(domains.domain_of_triangle[order], np.arange(domains.count + 1))
+            self._triangles[domains.key] = order, bounds
+        order, bounds = self._triangles[domains.key]
+        return order[bounds[domain] : bounds[domain + 1]]
 
     def domain_geometry(self, domains: Domains, domain: int) -> embree.Geometry | None:
         """Return a domain's triangles in their own hierarchy, or None if it has none."""
@@ -189,7 +220,7 @@ class SurfaceWorld:
         if key not in self._domains:
             if domains.domain_of_triangle is None:
                 raise SceneError("these domains do not say which triangles lie in them")
-            faces = self.scene.triangles.faces[domains.domain_of_triangle == domain]
+            faces = self.scene.triangles.faces[self._triangles_of(domains, domain)]
             if len(faces) == 0:
                 return None
             used, faces = np.unique(faces, return_inverse=True)

@@ -17,7 +17,7 @@ from simrender.rays.domains import morton_ranks
 from simrender.rays.integrators import AmbientOcclusion, PathTracing, SprayPathTracing
 from simrender.rays.trace import Trace
 from simrender.rays.visits import Visits, visits
-from simrender.rays.workload import load_workload
+from simrender.rays.workload import Workload, load_workload
 from simrender.rays.workload_card import DomainsCard
 from simrender.timeline import Timeline
 from tests.scenes import garden, garden_workload
@@ -47,22 +47,27 @@ _LIGHTING = [PathTracing(), AmbientOcclusion(2), SprayPathTracing(2, 3)]
 
 
 @cache
-def _garden(seed: int, balls: int, cut: int, lighting: int) -> Crossings:
-    workload = garden_workload("24x16", "24x16", 1, scene=garden(seed, balls))
-    usual = workload.trace()
+def _workload(seed: int, balls: int) -> Workload:
+    return garden_workload("24x16", "24x16", 1, scene=garden(seed, balls))
+
+
+@cache
+def _trace(seed: int, balls: int, lighting: int) -> Trace:
+    usual = _workload(seed, balls).trace()
     trace = Trace(usual.scene, usual.camera, usual.size, 1, _LIGHTING[lighting])
     trace.complete()
-    return Crossings(trace, workload.domains(_CUTS[cut]))
+    return trace
+
+
+@cache
+def _garden(seed: int, balls: int, cut: int, lighting: int) -> Crossings:
+    return Crossings(_trace(seed, balls, lighting), _workload(seed, balls).domains(_CUTS[cut]))
 
 
 def gardens() -> st.SearchStrategy[Crossings]:
     """Crossings of a small scene: random balls on a floor, cut in some way and lit in some way."""
-    kinds = (
-        st.integers(1, 4),
-        st.sampled_from([1, 12, 40]),
-        *(st.sampled_from(range(len(x))) for x in (_CUTS, _LIGHTING)),
-    )
-    return st.builds(_garden, *kinds)
+    cuts, lighting = (st.sampled_from(range(len(choices))) for choices in (_CUTS, _LIGHTING))
+    return st.builds(_garden, st.integers(1, 3), st.sampled_from([1, 25]), cuts, lighting)
 
 
 def play(

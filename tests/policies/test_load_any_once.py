@@ -9,12 +9,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from simrender import simulate
 from simrender.policies.domain_frame import stripes
 from simrender.policies.load_any_once import LoadAnyOnce
 from simrender.policies.queues import DomainQueues, fullest
 from simrender.rays.crossings import Crossings
 from simrender.rays.domains import from_triangles
-from tests.policies.driver import check_image, gardens, play, schedule, visits_of, wavelets
+from tests.policies.driver import WAVELETS, check_image, gardens, play, schedule, visits_of, wavelets
 from tests.policies.figure2 import A, B, C, D, figure2
 
 RANKS = [1, 2, 3, 7, 16]
@@ -106,32 +107,54 @@ def test_four_ranks_take_their_domains_in_the_programs_order():
     assert taken == program
 
 
-def test_in_situ_with_the_domain_map_of_the_program_as_it_was_built():
-    # The version of a library that it was built with left all Morton codes 0.
-    frame = play(LoadAnyOnce("in_situ"), wavelets(), 2, owner=np.repeat([1, 0], 32))
-    assert (frame.counters.visits, frame.counters.messages) == (82, 41)
-    assert max(event.step for event in frame.events) + 1 == 52
-    assert frame.counters.sent_rays == pytest.approx(45_887, rel=1e-3)
+@pytest.mark.parametrize(
+    ("ranks", "visits", "steps", "messages", "sent"), [(2, 82, 52, 41, 45_887), (4, 92, 31, 91, 88_994)]
+)
+def test_in_situ_with_the_domain_map_of_the_program_as_it_was_built(ranks, visits, steps, messages, sent):
+    # The version of a library that it was built with left all Morton codes 0, and its sort equal keys in this order.
+    order = [48, *range(33, 48), 32, *range(49, 64), 16, *range(1, 16), 0, *range(17, 32)]
+    owner = np.empty(64, np.int64)
+    owner[order] = np.arange(64) * ranks // 64
+    frame = play(LoadAnyOnce("in_situ"), wavelets(), ranks, owner=owner)
+    assert (frame.counters.visits, frame.counters.messages) == (visits, messages)
+    assert max(event.step for event in frame.events) + 1 == steps
+    assert frame.counters.sent_rays == pytest.approx(sent, rel=1e-3)
 
 
-OCCLUSION = "integrator={name: ambient_occlusion, samples: 8}"
+OCCLUSION = "integrator={name: ambient_occlusion, samples: 8, random_numbers: spray_program}"
 OCCLUSION_LOADS = {64: 52, 32: 80, 16: 148, 8: 160}
 
 
 @pytest.mark.parametrize("cache", OCCLUSION_LOADS)
-def test_ambient_occlusion_tests_as_many_rays_as_the_program(cache):
+def test_ambient_occlusion_loads_are_the_programs_within_3_percent(cache):
+    # The rays are those of the program but for roundings. Random numbers of one's own give 49 to 57, 79 to 98, 132 to
+    # 156 and 148 to 165 loads with seeds 1 to 8: fifteen domains are met by less than thirty of 570,000 rays.
     frame = play(LoadAnyOnce(cache=cache), wavelets(OCCLUSION))
-    check_tests(frame.counters, 124_862, 731_892, 0.01)
+    assert frame.counters.loads == pytest.approx(OCCLUSION_LOADS[cache], rel=0.03)
     assert frame.counters.visits == pytest.approx(165, rel=0.03)
-    # Fifteen domains are met by less than thirty of 570,000 rays in random directions, and each adds a load or several:
-    # seeds 1 to 8 give 49 to 57, 79 to 98, 132 to 156 and 148 to 165 loads.
-    assert frame.counters.loads == pytest.approx(OCCLUSION_LOADS[cache], rel=0.2)
+    check_tests(frame.counters, 124_862, 731_892)
 
 
-def test_ambient_occlusion_in_situ_sends_as_many_rays_as_the_program():
-    frame = play(LoadAnyOnce("in_situ"), wavelets(OCCLUSION), 2)
-    check_tests(frame.counters, 124_862, 731_892, 0.01)
-    assert frame.counters.sent_rays == pytest.approx(59_942, rel=0.01)
+@pytest.mark.parametrize(
+    ("owner", "visits", "steps", "messages", "sent"),
+    [(None, 176, 103, 75, 59_942), (np.repeat([1, 0], 32), 159, 101, 64, 56_721)],
+    ids=["Morton blocks", "as the program was built"],
+)
+def test_ambient_occlusion_in_situ_is_the_programs_within_3_percent(owner, visits, steps, messages, sent):
+    frame = play(LoadAnyOnce("in_situ"), wavelets(OCCLUSION), 2, owner=owner)
+    assert frame.counters.visits == pytest.approx(visits, rel=0.03)
+    assert max(event.step for event in frame.events) + 1 == pytest.approx(steps, rel=0.03)
+    assert frame.counters.messages == pytest.approx(messages, rel=0.03)
+    assert frame.counters.sent_rays == pytest.approx(sent, rel=1e-3)
+    check_tests(frame.counters, 124_862, 731_892)
+
+
+def test_the_simulation_counts_what_the_driver_of_these_tests_counts():
+    result = simulate("stampede2-skx", WAVELETS, LoadAnyOnce("in_situ"), nodes=4, islands=1)
+    frame = play(LoadAnyOnce("in_situ"), wavelets(), 4)
+    for name in ("visits", "radiance_tests", "shadow_tests", "messages", "sent_rays", "sent_bytes"):
+        assert result.counts[name] == getattr(frame.counters, name)
+    assert result.frame_time_s == pytest.approx(frame.env.now / 1e12, rel=1e-9)
 
 
 # Figure 2 of SpRay, from real triangles
