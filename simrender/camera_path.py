@@ -276,8 +276,9 @@ def _check(card: MachineCard, workload: Workload, policy: DistributedCache, fram
         raise UsageError(f"{name} needs a node for its master and its display beside those that render; use 2 or more")
     if frames < 1:
         raise UsageError(f"--frames {frames}: expected 1 or more")
-    if not 0 < (policy.threads or 1) <= getattr(card.processor, "cores", 1):
-        raise UsageError(f"policy.threads={policy.threads}: a node of {card.title} has 1 to {card.processor.cores} cores")
+    cores = getattr(card.processor, "cores", 1)
+    if policy.render_threads(card) > cores:
+        raise UsageError(f"policy.threads={policy.threads}: a node of {card.title} has {cores} cores")
     if policy.display and card.display is None:
         raise UsageError(f"policy.display=true: {card.title} has no section display; use policy.display=false")
     if card.display is not None and card.display.nodes > 1 and policy.display is not False:

@@ -6,6 +6,7 @@ does not fit.
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import sys
 import time  # noqa: TID251 - wall time is measured here, for a person, and never simulated
@@ -22,6 +23,7 @@ from simrender.errors import SimrenderError, UnitError, UsageError
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from simrender.camera_path import PathResult
     from simrender.rays.crossings import Crossings
     from simrender.rays.estimate import Estimate
     from simrender.rays.trace import Trace
@@ -335,6 +337,7 @@ def run(
     islands: str = "auto",
     nodes: Whole | None = None,
     gpus: Whole | None = None,
+    frames: Whole | None = None,
     set_: Set = (),
     seed: Whole = 1,
     json: Annotated[str | None, Parameter(negative="")] = None,
@@ -359,6 +362,8 @@ def run(
         Use only so many of the machine's nodes.
     gpus
         Use only so many GPUs of those.
+    frames
+        Along the camera's path, one after the other, under distributed_cache, whose caches stay warm.
     set_
         Change a value of a card: PATH=VALUE, where PATH starts with machine. or workload. or policy.
     seed
@@ -388,12 +393,19 @@ def run(
     targets = [path.resolve() for path in (Path(json or "-"), image, timeline) if path]
     if len(set(targets)) < len(targets):
         raise UsageError("--json, --image and --timeline: two of them name the same file")
+    sections = split_assignments(set_, ("machine", "workload", "policy"))
+    path = _along_path(machine, workload, policy, sections, frames, nodes, seed, cache)
+    if path is not None:
+        for option, given in (("--timeline", timeline), ("--explain", explain), ("--gpus", gpus)):
+            if given is not None:
+                raise UsageError(f"{option} does not go with frames along a camera's path")
+        return _publish_path(*path, json, image)
     count = _islands(islands)
     begin = time.perf_counter()
     with _Progress() as progress:
         result = simulate(
             machine, workload, policy, islands=count, nodes=nodes, gpus=gpus, seed=seed,
-            overrides=split_assignments(set_, ("machine", "workload", "policy")), cache=cache, progress=progress,
+            overrides=sections, cache=cache, progress=progress,
         )  # fmt: skip
     seconds = time.perf_counter() - begin
     _publish(result, json)
@@ -410,6 +422,59 @@ def run(
             _note(f"wrote {timeline}")
     elif image or timeline:
         _note("nothing was rendered, so no picture and no timeline were written")
+    _note(f"simulated in {seconds:.2f} s")
+    return 0 if result.feasible else 3
+
+
+def _along_path(
+    machine: str,
+    workload: str,
+    policy: str | None,
+    sections: Mapping[str, Sequence[str]],
+    frames: int | None,
+    nodes: int | None,
+    seed: int,
+    cache: Path | None,
+) -> tuple[PathResult, float] | None:
+    """Render frames along the camera's path if the policy is the one that does so; None if it is another."""
+    from simrender.simulation import PATH_POLICY, make_policy
+
+    if frames is None and policy not in {None, PATH_POLICY}:
+        return None
+    from simrender.hardware.machine import load_machine
+    from simrender.rays.workload import load_workload
+
+    card = load_machine(machine, sections["machine"])
+    loaded = load_workload(workload, sections["workload"], cache)
+    name, scheduler = make_policy(policy, loaded, sections["policy"])
+    if name != PATH_POLICY:
+        if frames is not None:
+            raise UsageError(f"--frames {frames}: {name} renders single frames; {PATH_POLICY} renders several")
+        return None
+    from simrender.camera_path import simulate_frames
+    from simrender.policies.distributed_cache import DistributedCache
+
+    assert isinstance(scheduler, DistributedCache)  # noqa: S101 - that is its name
+    begin = time.perf_counter()
+    with _Progress() as progress:
+        result = simulate_frames(card, loaded, scheduler, frames or 1, nodes=nodes, seed=seed, progress=progress)
+    return dataclasses.replace(result, machine=machine), time.perf_counter() - begin
+
+
+def _publish_path(result: PathResult, seconds: float, json: str | None, image: Path | None) -> int:
+    from simrender.report.files import write_image, write_json
+    from simrender.report.path import describe_path
+
+    if json == "-":
+        _print_json(result.to_dict())
+    else:
+        _console().print(describe_path(result))
+        if json:
+            write_json(Path(json), result.to_dict())
+            _note(f"wrote {json}")
+    if image and result.images:
+        write_image(image, result.images[-1])
+        _note(f"wrote {image}, the last frame")
     _note(f"simulated in {seconds:.2f} s")
     return 0 if result.feasible else 3
 
@@ -440,8 +505,6 @@ def compare(
         Folder of the trace cache.
 
     """
-    import dataclasses
-
     from simrender.accuracy.spray import compare as compared
     from simrender.report.comparison import describe_comparison
     from simrender.report.files import check_target, write_json

@@ -29,11 +29,14 @@ from simrender.timeline import Timeline
 
 Islands = int | Literal["auto"]
 
+PATH_POLICY = "distributed_cache"
+"""The policy that renders frames one after the other, with caches that stay warm."""
+
 
 def simulate(
     machine: str | MachineCard,
     workload: str | Workload,
-    policy: str | Policy | None = None,
+    policy: str | Policy | DomainPolicy | None = None,
     *,
     islands: Islands = "auto",
     nodes: int | None = None,
@@ -88,7 +91,9 @@ def simulate(
     check_seed(seed)
     if isinstance(workload, str):
         workload = load_workload(workload, given.get("workload", ()), cache)
-    name, scheduler = _policy(policy, workload, given.get("policy", ()))
+    name, scheduler = make_policy(policy, workload, given.get("policy", ()))
+    if name == PATH_POLICY:
+        raise UsageError(f"{name} renders frames along the camera's path: simrender.camera_path.simulate_frames")
     if isinstance(scheduler, DomainPolicy):
         return _simulate_domains(machine, card, workload, name, scheduler, count, islands, seed, progress)
     if not isinstance(workload.integrator, PathTracing | RayCasting):
@@ -247,8 +252,16 @@ def _overrides(
     return overrides
 
 
-def _policy(policy: str | Policy | None, workload: Workload, overrides: Sequence[str]) -> tuple[str, Policy]:
-    """Return the scheduler and its name: the card's own parameters hold where its own policy is asked for."""
+def make_policy(
+    policy: str | Policy | DomainPolicy | None, workload: Workload, overrides: Sequence[str]
+) -> tuple[str, Policy | DomainPolicy]:
+    """Return the scheduler and its name: the card's own parameters hold where its own policy is asked for.
+
+    Raises
+    ------
+    UnknownNameError, CardError, UsageError
+
+    """
     if policy is not None and not isinstance(policy, str):
         if overrides:
             raise UsageError("overrides of the policy need its name, not one that is made already")
@@ -261,7 +274,7 @@ def _policy(policy: str | Policy | None, workload: Workload, overrides: Sequence
     document.data.pop("name", None)
     for override in overrides:
         document.override(model, override, "policy")
-    scheduler: Policy = document.validate(model)
+    scheduler: Policy | DomainPolicy = document.validate(model)
     return name, scheduler
 
 

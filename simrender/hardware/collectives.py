@@ -257,7 +257,8 @@ class Communicator:
         """Send a message as soon as its sender has an overhead to spare for it; return when."""
         overhead, source = self.transport.overhead_ticks, self._members[sent.source]
         tick = ready + overhead
-        source.leaving = sorted(other for other in source.leaving if other > self._now)
+        now = self._now
+        source.leaving = sorted(other for other in source.leaving if other > now)
         for other in source.leaving:
             if abs(other - tick) < overhead:
                 tick = other + overhead
@@ -291,6 +292,8 @@ class Communicator:
                 continue
             box.receives.remove(receive)
             box.messages[sent.source].remove(sent)
+            if not box.messages[sent.source]:
+                del box.messages[sent.source]
             if sent.nbytes <= self.transport.card.eager:
                 _succeed_at(receive.done, self._now, sent.as_message(self._now))
             else:

@@ -197,11 +197,11 @@ class OutOfCore:
         if len(rows) == 0:
             return rows
         if queues is self.rq:
-            kept = rows[self.hbuf.farther_than(rows)]
+            kept: Ids = rows[self.hbuf.farther_than(rows)]
             self.counters.radiance_filtered += len(rows) - len(kept)
             return kept
         rays = self.tree.rows["ray"][rows]
-        kept = rows[~self.flags.occluded[rays] & self.hbuf.visibility(rays)]
+        kept = rows[self.hbuf.visibility(rays) & ~self.flags.occluded[rays]]
         self.counters.shadow_filtered += len(rows) - len(kept)
         return kept
 

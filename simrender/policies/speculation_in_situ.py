@@ -87,12 +87,8 @@ class Processed:
     ----------
     radiance, shadow : int64 array (domains,)
         Queries in each domain.
-    isect_cache : int64 array (n,)
-        The rays that were spawned, right and wrong ones.
-    domain : int16 array (n,)
-        Where each was spawned.
-    right : bool array (n,)
-        Whether the hit that spawned it is the nearest one in the buffers of all ranks.
+    right : int64 array
+        The rows of hits that are the nearest in the buffers of all ranks.
     occluded : bool array
         Which of the batch's shadow rays have something in their way.
 
@@ -100,9 +96,7 @@ class Processed:
 
     radiance: Ids
     shadow: Ids
-    isect_cache: Ids
-    domain: NDArray[np.int16]
-    right: Mask
+    right: Ids
     occluded: Mask
 
 
@@ -242,26 +236,29 @@ class InSitu:
         nearest = np.full(self.frame.ranks, np.inf, np.float32)
         _update_tbuf(queued.first, self.owner[domain[queued.rows]], hit, nearest, success, right)
         counters.rejected_hits += int((hit < np.inf).sum() - success.sum())
-        rays, count = tree.children(queued.rows[success])
-        counters.wrong_rays += int((rays >= tree.trace.rays).sum())
-        born = np.repeat(tree.rows["domain"][queued.rows[success]], count)
-        of_kind = tree.rays["shadow"][rays]
+        shaded, nearest_of_all = queued.rows[success], queued.rows[right]
+        # Of what wrong hits spawn only its number matters: it is tested at once, where it is born, and then forgotten.
+        spawned, spawned_shadows = tree.spawned(shaded)
+        counters.wrong_rays += int(spawned.sum() - tree.spawned(nearest_of_all)[0].sum())
+        born = domain[shaded]
 
-        domain = tree.rows["domain"]
         hit = tree.hits(shadow.rows)
         tested, occluded = np.zeros(len(hit), np.bool_), np.zeros(len(shadow.rays), np.bool_)
-        _test_shadows(
-            shadow.first, self.owner[domain[shadow.rows]], hit, np.full(self.frame.ranks, -1), tested, occluded
-        )
+        stopped = np.full(self.frame.ranks, -1)
+        _test_shadows(shadow.first, self.owner[domain[shadow.rows]], hit, stopped, tested, occluded)
         self.retire(queued.rays)
-        done = Processed(
-            np.bincount(domain[queued.rows[~queued.cached]], minlength=domains)
-            + np.bincount(born[~of_kind], minlength=domains),
-            np.bincount(domain[shadow.rows[tested]], minlength=domains) + np.bincount(born[of_kind], minlength=domains),
-            rays, born, np.repeat(right[success], count), occluded,
-        )  # fmt: skip
-        self.count_memory(batch, done)
-        return done
+
+        def count(rows: Ids, spawned: NDArray[np.int32]) -> Ids:
+            queries = np.bincount(domain[rows], minlength=domains) + np.bincount(born, spawned, domains)
+            return queries.astype(np.int64)
+
+        self.count_memory(batch, self.owner[born], spawned, spawned_shadows)
+        return Processed(
+            count(queued.rows[~queued.cached], spawned - spawned_shadows),
+            count(shadow.rows[tested], spawned_shadows),
+            nearest_of_all,
+            occluded,
+        )
 
     def resolve_visibility(self, batch: Batch, done: Processed) -> Batch:
         """Keep the rays that the nearest hits of all ranks spawned, and queue them (listing 7).
@@ -272,7 +269,8 @@ class InSitu:
         check_lit(self.tree, lit)
         self.retire(batch.shadow.rays)
         tree, owner = self.tree, self.owner
-        rays, domain = done.isect_cache[done.right], done.domain[done.right]
+        rays, count = tree.children(done.right)
+        domain = np.repeat(tree.rows["domain"][done.right], count)
         birth = rows_in(rays, domain, tree.rays["first"], tree.rays["last"], tree.rows["domain"])
         hit = np.full(len(rays), np.inf, np.float32)
         hit[birth >= 0] = tree.hits(birth[birth >= 0])
@@ -299,7 +297,9 @@ class InSitu:
         if len(rays):
             self.frame.retired.append(rays)
 
-    def count_memory(self, batch: Batch, done: Processed) -> None:
+    def count_memory(
+        self, batch: Batch, spawner: Ids, spawned: NDArray[np.int32], spawned_shadows: NDArray[np.int32]
+    ) -> None:
         """Note what each rank holds: its rays, those it got, those it spawned, and the buffers."""
         frame, ranks, held = self.frame, self.frame.ranks, np.zeros(self.frame.ranks)
         for queued in (batch.radiance, batch.shadow):
@@ -308,9 +308,8 @@ class InSitu:
             held += np.bincount(queued.source, minlength=ranks) * self.ray_bytes
             held += np.bincount(source, minlength=ranks) * POINTER_BYTES
             held += np.bincount(target[target != source], minlength=ranks) * self.ray_bytes
-        spawner, shadow = self.owner[done.domain], self.tree.rays["shadow"][done.isect_cache]
-        held += np.bincount(spawner, minlength=ranks) * self.ray_bytes
-        held += np.bincount(spawner[~shadow], minlength=ranks) * INTERSECTION_BYTES
+        held += np.bincount(spawner, spawned, ranks) * self.ray_bytes
+        held += np.bincount(spawner, spawned - spawned_shadows, ranks) * INTERSECTION_BYTES
         held = held * frame.weight + 2.0 * self.tbuf_bytes + self.obuf_bytes
         frame.peak_bytes[:] = np.maximum(frame.peak_bytes, held).tolist()
 

@@ -50,8 +50,8 @@ class Blocks:
     The first block begins with the root, alone in the place of a pair. A block is filled breadth first, by pairs of
     children, from the root of a subtree; each pair that it has no room for then begins a subtree of its own, depth
     first. A subtree that ends before its block is full is followed by the next one without a gap (but where larger
-    blocks begin), so that a block may hold several, and a pair never lies in two blocks. Triangles lie in the order in which a traversal of all leaves
-    meets them.
+    blocks begin), so that a block may hold several, and a pair never lies in two blocks. Triangles lie in the order in
+    which a traversal of all leaves meets them.
 
     Attributes
     ----------

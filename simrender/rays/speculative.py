@@ -23,8 +23,9 @@ ray          i8
 domain       i2
 entry        f4       distance at which the ray enters the domain; a lower bound of its hit
 hit          f4       nearest hit in the domain; NaN unknown, infinite for none
-child_first  i8       first of the rays that its hit spawns
-child_count  i4       how many these are; -1 unknown
+child_count  i4       rays that its hit spawns; -1 unknown
+child_shadow i4       shadow rays among them
+child_first  i8       first of them; -1 unless they have been made
 ============ ======== ============================================================================
 
 **Order of hits.** A true ray's nearest hit is the one that the trace found. Another domain may have a hit at the same
@@ -51,7 +52,7 @@ Columns = dict[str, Any]
 _GEOMETRY = tuple(name for name in GEOMETRY if name != "parent")
 _RAY = ("first", "last", "depth", "shadow", "sample", "spawner")
 _ROW = ("ray", "domain", "entry", "hit")
-_CHILDREN = ("child_first", "child_count")
+_CHILDREN = ("child_count", "child_shadow", "child_first")
 
 
 def ray_tree(crossings: Crossings) -> RayTree:
@@ -99,6 +100,7 @@ class RayTree:
         none = childless(np.zeros((0, 3), np.float32))
         self._spawned = Table({name: none[name] for name in _GEOMETRY})
         self._name, self._changed = f"speculative-{self.domains.key}", False
+        self._shaded: list[Ids] = []
         self._load()
 
     # -- what schedulers ask --------------------------------------------------------------------------------------
@@ -121,11 +123,21 @@ class RayTree:
             Of camera or bounced rays that hit something there; no row twice.
 
         """
-        unknown = rows[self.rows["child_count"][rows] < 0]
+        unknown = rows[(self.rows["child_first"][rows] < 0) & (self.rows["child_count"][rows] != 0)]
         if len(unknown):
-            self._spawn(unknown)
+            self._append(self._shade(unknown), unknown)
         count = self.rows["child_count"][rows]
         return _ranges(self.rows["child_first"][rows], count), count
+
+    def spawned(self, rows: Ids) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Return how many rays the hits of some rows spawn, and how many of these are shadow rays.
+
+        That is all there is to know of wrong rays which nobody takes further; ``rows`` are as for `children`.
+        """
+        unknown = rows[self.rows["child_count"][rows] < 0]
+        if len(unknown):
+            self._shade(unknown)
+        return self.rows["child_count"][rows], self.rows["child_shadow"][rows]
 
     def rows_of(self, rays: Ids) -> Ids:
         """Return the rows of some rays, ray after ray."""
@@ -137,7 +149,8 @@ class RayTree:
         if self._changed:
             own, rows = slice(self.trace.rays, None), slice(self._base[-1], None)
             columns = {name: self.rays[name][own] for name in _RAY} | {name: self.rows[name][rows] for name in _ROW}
-            columns |= {name: self.rows[name] for name in _CHILDREN}
+            shaded = np.unique(np.concatenate(self._shaded))
+            columns |= {"shaded": shaded} | {name: self.rows[name][shaded] for name in _CHILDREN}
             columns |= {f"geometry_{name}": self._spawned[name] for name in _GEOMETRY}
             self.trace.store.save(self._name, columns)
             self._changed = False
@@ -173,8 +186,7 @@ class RayTree:
         return Table({
             "ray": np.repeat(np.arange(rays.count), rays["last"] - rays["first"]),
             **joined,
-            "child_first": np.zeros(count, np.int64),
-            "child_count": np.full(count, -1, np.int32),
+            **_childless(count),
         })  # fmt: skip
 
     def _join(self) -> None:
@@ -197,6 +209,8 @@ class RayTree:
         rows["child_first"][true] = trace.column("first_child")[ray]
         rows["child_count"][true] = trace.column("children")[ray]
         spawner = rays["spawner"][trace.first[1] :]
+        shadow = rays["shadow"][trace.first[1] :]
+        rows["child_shadow"][true] = np.bincount(spawner[shadow], minlength=trace.rays)[ray]
         spawner[:] = true_row[spawner]
 
     def _behind(self, rows: Ids, hit: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -220,8 +234,8 @@ class RayTree:
             self.rows["hit"][mine] = found["hit"]
             self._changed = True
 
-    def _spawn(self, rows: Ids) -> None:
-        """Shade the wrong hits of some rows, and append what they spawn."""
+    def _shade(self, rows: Ids) -> Columns:
+        """Shade the wrong hits of some rows, count what they spawn, and return it."""
         rays = self._geometry(self.rows["ray"][rows])
         hits = self.world.domain_hits(rays, np.arange(len(rows)), self.domains, self.rows["domain"][rows])
 
@@ -234,14 +248,17 @@ class RayTree:
 
         parts = [work(slice(0, 0)), *embree.in_chunks(work, len(rows))]  # the first one loads the kernels
         made = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        count = made["children"].astype(np.int32)
-        self.rows["child_first"][rows] = self.rays.count + np.cumsum(count) - count
-        self.rows["child_count"][rows] = count
-        self._append(made, rows[made["parent"]])
+        self.rows["child_count"][rows] = made["children"]
+        self.rows["child_shadow"][rows] = np.bincount(made["parent"][made["kind"] == SHADOW], minlength=len(rows))
+        self._shaded.append(rows)
         self.shaded_rows += len(rows)
         self._changed = True
+        return made
 
-    def _append(self, made: Columns, spawner: Ids) -> None:
+    def _append(self, made: Columns, rows: Ids) -> None:
+        """Append the rays that the hits of some rows spawned."""
+        count, spawner = made["children"].astype(np.int64), rows[made["parent"]]
+        self.rows["child_first"][rows] = self.rays.count + np.cumsum(count) - count
         first, domain, entry = enter_domains(self.domains, made["origin"], made["direction"], made["reach"])
         parent, before = self.rows["ray"][spawner], self.rays.count
         self.rays.append({
@@ -257,8 +274,7 @@ class RayTree:
             "domain": domain,
             "entry": entry,
             "hit": np.full(len(domain), np.nan, np.float32),
-            "child_first": np.zeros(len(domain), np.int64),
-            "child_count": np.full(len(domain), -1, np.int32),
+            **_childless(len(domain)),
         })  # fmt: skip
         self._spawned.append({name: made[name] for name in _GEOMETRY})
 
@@ -277,15 +293,15 @@ class RayTree:
         return out
 
     def _load(self) -> None:
-        names = (*_RAY, *_ROW, *_CHILDREN, *(f"geometry_{name}" for name in _GEOMETRY))
+        names = (*_RAY, *_ROW, "shaded", *_CHILDREN, *(f"geometry_{name}" for name in _GEOMETRY))
         found = self.trace.store.load(self._name, names)
-        if found is None or len(found["child_first"]) != self._base[-1] + len(found["domain"]):
+        if found is None:
             return
         self.rays.append({name: found[name] for name in _RAY})
-        true = self._base[-1]
-        self.rows.append({name: found[name] for name in _ROW} | {name: found[name][true:] for name in _CHILDREN})
+        self.rows.append({name: found[name] for name in _ROW} | _childless(len(found["domain"])))
+        self._shaded.append(found["shaded"])
         for name in _CHILDREN:
-            self.rows[name][:true] = found[name][:true]
+            self.rows[name][found["shaded"]] = found[name]
         self._spawned.append({name: found[f"geometry_{name}"] for name in _GEOMETRY})
 
 
@@ -318,6 +334,15 @@ class Table:
                 self.columns[name][: self.count] = column[: self.count]
             self.columns[name][self.count : end] = rows[name]
         self.count = end
+
+
+def _childless(rows: int) -> Columns:
+    """Return the columns of rows of which it is unknown what they spawn."""
+    return {
+        "child_count": np.full(rows, -1, np.int32),
+        "child_shadow": np.full(rows, -1, np.int32),
+        "child_first": np.full(rows, -1, np.int64),
+    }
 
 
 def _ranges(first: Ids, count: NDArray[Any]) -> Ids:

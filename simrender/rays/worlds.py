@@ -223,9 +223,9 @@ class SurfaceWorld:
             faces = self.scene.triangles.faces[self._triangles_of(domains, domain)]
             if len(faces) == 0:
                 return None
-            used, faces = np.unique(faces, return_inverse=True)
+            used, corners = np.unique(faces, return_inverse=True)
             vertices = self.scene.triangles.vertices[used]
-            self._domains[key] = embree.Geometry(vertices, faces.reshape(-1, 3).astype(np.int32))
+            self._domains[key] = embree.Geometry(vertices, corners.reshape(-1, 3).astype(np.int32))
         return self._domains[key]
 
 

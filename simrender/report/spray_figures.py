@@ -94,7 +94,14 @@ def plot_history(runs: Sequence[Run], title: str) -> Figure:
         for number, bounces in enumerate(dict.fromkeys(r.bounces for r in runs)):
             line = [r for r in runs if (r.scene, r.bounces) == (scene, bounces)]
             depth = [r.history_depth for r in line]
-            axes.plot(depth, [r.frame_time_s for r in line], "o-", color=f"C{number}", label=f"{bounces} bounces", ms=4)
+            axes.plot(
+                depth,
+                [r.frame_time_s for r in line],
+                "o-",
+                color=f"C{number}",
+                label=f"{bounces} bounce{'s' if bounces > 1 else ''}",
+                ms=4,
+            )
             axes.plot(depth, [r.load_s for r in line], ":", color=f"C{number}")
         axes.set_title(f"{scene}: frame (solid), loading (dotted)", fontsize=9, loc="left")
         axes.set_xlabel("history depth", fontsize=8)
@@ -102,6 +109,8 @@ def plot_history(runs: Sequence[Run], title: str) -> Figure:
         axes.set_ylim(bottom=0.0)
         axes.tick_params(labelsize=7)
         axes.spines[["top", "right"]].set_visible(False)
-    panels[-1].legend(fontsize=7, frameon=False)
+        axes.set_xticks(sorted({r.history_depth for r in runs}))
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", fontsize=7, frameon=False)
     figure.suptitle(title, x=0.01, ha="left", fontsize=11)
     return figure
