@@ -291,6 +291,8 @@ def _replicate(
             rays.complete()
         counted.append(replica_counts(workload, rays, workload.domain_crossings(s, crossings.domains)))
         images.append(rays.image())
+        if s != seed:
+            workload.forget(s)
     names = list(counted[0])
     if replicas > 1 and all((other == images[0]).all() for other in images[1:]):
         warnings.warn("nothing in this image is random, so replicas tell nothing of its error", stacklevel=2)
@@ -338,6 +340,7 @@ def run(
     nodes: Whole | None = None,
     gpus: Whole | None = None,
     frames: Whole | None = None,
+    tile: Literal["auto"] | None = None,
     set_: Set = (),
     seed: Whole = 1,
     json: Annotated[str | None, Parameter(negative="")] = None,
@@ -364,6 +367,8 @@ def run(
         Use only so many GPUs of those.
     frames
         Along the camera's path, one after the other, under distributed_cache, whose caches stay warm.
+    tile
+        auto: where speculation needs more memory than a node has, cut the image into as few tiles as fit.
     set_
         Change a value of a card: PATH=VALUE, where PATH starts with machine. or workload. or policy.
     seed
@@ -393,7 +398,9 @@ def run(
     targets = [path.resolve() for path in (Path(json or "-"), image, timeline) if path]
     if len(set(targets)) < len(targets):
         raise UsageError("--json, --image and --timeline: two of them name the same file")
-    sections = split_assignments(set_, ("machine", "workload", "policy"))
+    sections = split_assignments(
+        (*set_, *([f"policy.tiles={tile}"] if tile else [])), ("machine", "workload", "policy")
+    )
     path = _along_path(machine, workload, policy, sections, frames, nodes, seed, cache)
     if path is not None:
         for option, given in (("--timeline", timeline), ("--explain", explain), ("--gpus", gpus)):

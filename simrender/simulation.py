@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +21,7 @@ from simrender.policies.domain_frame import DomainPolicy
 from simrender.policies.frame import Frame, Policy
 from simrender.policies.islands import Fit, Layout, fit
 from simrender.policies.rank import PIXEL_BYTES, Rank
+from simrender.policies.speculation import Speculation
 from simrender.rays.integrators import PathTracing, RayCasting
 from simrender.rays.partition import Footprint, Partition
 from simrender.rays.trace import Progress
@@ -235,7 +237,23 @@ def _simulate_domains(
             "left_out": [{"what": "the frame", "why": "it does not fit"}],
         }
         return Result(**facts, uncalibrated=owned_up(deciding), scope=cause)
-    return render(card, workload, policy, chosen, domains, seed, facts)
+    return _in_tiles(policy, lambda scheduler: render(card, workload, scheduler, chosen, domains, seed, facts))
+
+
+_MOST_TILES = 1024
+"""Into which an image is cut at most so that its rays fit."""
+
+
+def _in_tiles(policy: DomainPolicy, render_with: Callable[[DomainPolicy], Result]) -> Result:
+    """Render, with the image in as few tiles (a power of two) as let its rays fit where the policy leaves that open."""
+    if not isinstance(policy, Speculation) or policy.tiles != "auto":
+        return render_with(policy)
+    tiles = 1
+    while True:
+        result = render_with(dataclasses.replace(policy, tiles=tiles))
+        if result.feasible or tiles >= _MOST_TILES:
+            return dataclasses.replace(result, memory=result.memory | {"tiles": tiles})
+        tiles *= 2
 
 
 def _overrides(

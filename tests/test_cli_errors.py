@@ -47,7 +47,8 @@ def test_unknown_names_say_what_is_near(bad, tiny_card):
 
 def test_unknown_words_of_the_command_line(bad, tiny_card):
     assert (
-        bad("rnu") == 'Unknown command "rnu". Did you mean "run"? Available commands: list, show, trace, run, compare, network.'
+        bad("rnu")
+        == 'Unknown command "rnu". Did you mean "run"? Available commands: list, show, trace, run, compare, network.'
     )
     assert bad("list", "machine").endswith('Did you mean "machines"?')
     assert bad("run", "dgx2", tiny_card, "--polcy", "x") == "Unknown option: --polcy. Did you mean --policy?"

@@ -53,6 +53,8 @@ class DistributedCache:
         Side, in published pixels, of the tiles that the master hands out; to the nearest whole number of packets.
     static : float
         Share of the tiles that nodes begin with, the same ones in each frame; at least one each if there are enough.
+        The more, the more a node finds of the last frame in its cache, and the less there is left to balance. The paper
+        gives neither this share nor the size of a tile.
     packets : int
         Packets of 64 pixels that a thread takes from its node's queue at once.
     blocks : "scaled" or "full"
@@ -214,16 +216,15 @@ class Cluster:
         self.counts = [FrameCounts(trace_ticks=[0] * self.ranks, fetch_ticks=[0] * self.ranks) for _ in frames]
         self._complete = [env.event() for _ in frames]
         self._running = [self.ranks] * len(frames)
-        self._dealt = [self.begins_with(frame, self.ranks).start for frame in frames]
+        self._dealt = [self.begins_with(frame, self.ranks - 1).stop for frame in frames]
         if display is not None:
             for frame in range(len(frames)):
                 display.complete(frame).callbacks.append(partial(self._shown, frame))
 
     def begins_with(self, frame: TiledFrame, rank: int) -> range:
-        """Return the tiles that a node begins a frame with; those from that of the first rank too many on are dealt."""
-        each = max(int(self.policy.static * frame.tiles / self.ranks), 1)
-        first = min(rank * each, frame.tiles)
-        return range(first, min(first + each, frame.tiles))
+        """Return the tiles that a node begins a frame with; those after the last node's are dealt to who asks."""
+        share = max(int(self.policy.static * frame.tiles), min(self.ranks, frame.tiles))
+        return range(rank * share // self.ranks, (rank + 1) * share // self.ranks)
 
     def next_tile(self, frame: int) -> int | None:
         """Deal the next tile of a frame, if there is one."""
@@ -307,8 +308,7 @@ class RenderNode:
         self._get_bytes = np.zeros(packets)
         self._owners: dict[int, NDArray[np.int64]] = {}
         self._over = False
-        for tile in cluster.begins_with(self._frame, self.rank):
-            self._queue_tile(tile)
+        self._queue_tiles(cluster.begins_with(self._frame, self.rank))
 
     def together(self, threads: list[Steps]) -> simpy.Event:
         """Return what happens when all threads are done."""
@@ -337,8 +337,8 @@ class RenderNode:
             packet, begin = self._queue[0], self._taken
             size, due = int(frame.pixels[packet]), int(self._gets[packet])
             some = min(left, size - begin)
-            seconds += float(frame.seconds[packet]) * (some / size if size else 1.0)
-            if due and size:
+            seconds += float(frame.seconds[packet]) * (some / size)
+            if due:
                 issued = due * begin // size
                 new = due * (begin + some) // size - issued
                 if new and not gets:
@@ -370,25 +370,25 @@ class RenderNode:
         if tile is None:
             self._over = True
         else:
-            self._queue_tile(tile)
+            self._queue_tiles(range(tile, tile + 1))
         asking.succeed()
         return not self._over
 
-    def _queue_tile(self, tile: int) -> None:
-        """Queue the packets of a tile, and find out which of their references miss."""
+    def _queue_tiles(self, tiles: range) -> None:
+        """Queue the packets of consecutive tiles, and find out which of their references miss."""
         frame = self._frame
-        begin, end = int(frame.first[tile]), int(frame.first[tile + 1])
-        self._counts.tiles += 1
+        begin, end = int(frame.first[tiles.start]), int(frame.first[tiles.stop])
+        self._counts.tiles += len(tiles)
         self._queue.extend(range(begin, end))
-        if self._fetchers:
+        if self._fetchers or begin == end:
             return
         owners, packet_of = [], []
         for cache, stream, nbytes in zip(
             self._caches, frame.streams, (NODE_BLOCK_BYTES, TRIANGLE_BLOCK_BYTES), strict=True
         ):
             first, last = stream.first[begin], stream.first[end]
-            refers = stream.block[first:last]
-            missed = np.flatnonzero(cache.replay(refers) == MISS)
+            refers, order = stream.block[first:last], self._order(stream.first[begin : end + 1] - first)
+            missed = order[cache.replay(refers[order]) == MISS]
             of = np.searchsorted(stream.first, missed + first, side="right") - 1
             owners.append(cache.blocks.owner(refers[missed].astype(np.int64)))
             packet_of.append(of)
@@ -401,6 +401,22 @@ class RenderNode:
         parts = np.split(np.concatenate(owners)[order], np.cumsum(misses)[:-1])
         self._owners.update((begin + i, part) for i, part in enumerate(parts) if len(part))
         self._gets[begin:end] = np.rint(misses * frame.weight).astype(np.int64)
+
+    def _order(self, first: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Return the order in which references of packets come, as threads that share a cache make them in turn.
+
+        A packet that stands for many is shared by all threads, which then refer to the same blocks.
+        """
+        each = self._cluster.policy.packets / self._frame.weight
+        run = max(1, round(each))
+        together = run * self.threads if each >= 1.0 else max(1, round(each * self.threads))
+        references = np.arange(first[-1])
+        if together == 1:
+            return references
+        length = np.diff(first)
+        packet = np.repeat(np.arange(len(length)), length)
+        leader = first[packet // run * run]
+        return np.lexsort((packet // run, references - leader, packet // together))
 
     # -- what threads do ------------------------------------------------------------------------------------------
 

@@ -264,9 +264,11 @@ class DomainRank:
             frame.timeline.add(self.device, COPY, begin, int(frame.env.now), 0.0, rays * frame.weight)
 
     def combine(self, nbytes: float) -> Steps:
-        """Combine a buffer of all ranks, element by element."""
-        frame, begin = self._frame, int(self._frame.env.now)
+        """Combine a buffer of all ranks, element by element, once all have come."""
+        frame = self._frame
         if self.comm is not None:
+            yield from self.barrier()
+            begin = int(frame.env.now)
             self._collectives, self._asked = self._collectives + 1, 0
             yield self.comm.allreduce(nbytes)
             frame.timeline.add(self.device, SYNC, begin, int(frame.env.now), 0.0, 0.0)
@@ -351,11 +353,16 @@ class DomainRank:
             yield self.comm.barrier()
 
     def merge_frame(self) -> Steps:
-        """Add up the images of all ranks on rank 0."""
+        """Add up the images of all ranks of an island on its first, which sends its scan lines to the very first."""
         frame = self._frame
-        if self.comm is None:
-            return
-        yield from self.barrier()
+        nbytes = float(PIXEL_BYTES * frame.published[0] * frame.published[1])
+        nbytes *= float((frame.rank_of_pixel >= 0).mean())
         begin = int(frame.env.now)
-        yield self.comm.reduce(float(PIXEL_BYTES * frame.published[0] * frame.published[1]))
-        frame.timeline.add(self.device, MERGE, begin, int(frame.env.now), 0.0, 0.0)
+        if self.comm is not None:
+            yield from self.barrier()
+            begin = int(frame.env.now)
+            yield self.comm.reduce(nbytes)
+        if self.index == 0 and frame.first_rank > 0:
+            yield frame.machine.copy(self.device, 0, nbytes)
+        if int(frame.env.now) > begin:
+            frame.timeline.add(self.device, MERGE, begin, int(frame.env.now), nbytes, 0.0)

@@ -27,19 +27,17 @@ class HistoryBuffer:
     tree : RayTree
     buffer : float32 array (samples, H)
         Shared with ranks that have other samples.
-    samples : int64 array
-        Those of this rank.
 
     """
 
-    def __init__(self, tree: RayTree, buffer: NDArray[np.float32], samples: Ids) -> None:
-        self.tree, self.buffer, self.samples = tree, buffer, samples
+    def __init__(self, tree: RayTree, buffer: NDArray[np.float32]) -> None:
+        self.tree, self.buffer = tree, buffer
         self.ray_depth, self.depth = 0, buffer.shape[1]
 
-    def reset(self, ray_depth: int) -> None:
-        """Forget everything: the buffer now begins at a depth."""
+    def reset(self, ray_depth: int, samples: Ids) -> None:
+        """Forget everything about some samples: the buffer now begins at a depth."""
         self.ray_depth = ray_depth
-        self.buffer[self.samples] = np.inf
+        self.buffer[samples] = np.inf
 
     def visibility(self, rays: Ids) -> Mask:
         """Return which rays come from the hits that are nearest so far."""
@@ -101,13 +99,16 @@ class Flags:
 
 
 def check_lit(tree: RayTree, rays: Ids) -> None:
-    """Check that nothing is in the way of shadow rays whose light is added to the image.
+    """Check that shadow rays whose light is added to the image are true ones, with nothing in their way.
 
     Raises
     ------
     InvariantError
 
     """
+    wrong = rays[rays >= tree.trace.rays]
+    if len(wrong):
+        raise InvariantError(f"the light of shadow ray {wrong[0]} was added, and a wrong hit spawned it")
     occluded = rays[np.isfinite(tree.trace.column("t")[rays])]
     if len(occluded):
         raise InvariantError(f"the light of shadow ray {occluded[0]} was added, and something is in its way")

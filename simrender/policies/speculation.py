@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 
+from simrender.policies.blocking import Blocking, equal_tiles, program_tiles
 from simrender.policies.domain_frame import Steps
 from simrender.policies.domain_rank import DomainRank
 from simrender.policies.history import Flags, HistoryBuffer, bounces, check_lit, rows_in
@@ -47,6 +48,9 @@ class Speculation:
         Domains in a rank's cache: a number, a share such as 25%, or all. Least recently used ones make room.
     history_depth : int, optional
         Hits of a path that may be guesses, H; as many as a path can have, by default, as in the paper. In situ it is 1.
+    tiles : int or "auto"
+        Parts that the image is rendered in, one after the other: what rays, queues and buffers take is divided among
+        them. Each rank takes a share of each. ``auto``: the smallest power of two with which they fit into memory.
     ray_bytes : float, optional
         Size of a ray: 64 B in situ and 64 B + 4 B H out of core, as in the authors' program, by default.
     header_bytes : float
@@ -57,8 +61,9 @@ class Speculation:
         The rank of each domain in situ; blocks in Morton order by default.
     like_program : bool
         Follow the authors' program where it departs from the paper's listings: domains with equal scores come as the
-        C++ library sorts them; in situ a rank takes all hits that it cached before any other ray. What the program does
-        wrong is not followed.
+        C++ library sorts them; in situ a rank takes all hits that it cached before any other ray; the image is cut into
+        vertical stripes out of core, and into tiles of 1,048,576 samples a rank, unless ``tiles`` says how many. What
+        the program does wrong is not followed.
 
     """
 
@@ -67,6 +72,7 @@ class Speculation:
     data: Literal["out_of_core", "in_situ"] = "out_of_core"
     cache: str | int = "all"
     history_depth: Annotated[int, Field(ge=1)] | None = None
+    tiles: Annotated[int, Field(ge=1)] | Literal["auto"] = 1
     ray_bytes: Annotated[float, Field(gt=0)] | None = None
     header_bytes: Annotated[float, Field(ge=0)] = 16.0
     threads: Annotated[int, Field(ge=1)] | None = None
@@ -81,13 +87,29 @@ class Speculation:
     def rank(self, me: DomainRank) -> Steps:
         """Render one frame."""
         tree = ray_tree(me.frame.crossings)
+        blocking = me.alike(lambda: self.blocking(me))
         if self.in_situ:
-            shared = me.alike(lambda: InSitu(me.frame, tree, self.ray_bytes, self.header_bytes, self.like_program))
-            yield from shared.spray(me)
+            shared = me.alike(
+                lambda: InSitu(me.frame, tree, blocking, self.ray_bytes, self.header_bytes, self.like_program)
+            )
+            for tile in range(blocking.tiles):
+                yield from shared.spray(me, tile)
         else:
-            yield from OutOfCore(self, me, tree).spray()
+            mine = OutOfCore(self, me, tree, blocking)
+            for tile in range(blocking.tiles):
+                yield from mine.spray(tile)
         yield from me.merge_frame()
         tree.save()
+
+    def blocking(self, me: DomainRank) -> Blocking:
+        """Cut the image into tiles, and these into the parts of the ranks."""
+        frame = me.frame
+        if self.like_program and self.tiles == 1 and (frame.rank_of_pixel >= 0).all():
+            samples = frame.trace.samples * frame.weight
+            found = program_tiles(frame.trace.size, samples, frame.ranks, in_situ=self.in_situ)
+            frame.rank_of_pixel = found.rank
+            return found
+        return equal_tiles(frame.rank_of_pixel, 1 if self.tiles == "auto" else self.tiles)
 
 
 class OutOfCore:
@@ -106,15 +128,15 @@ class OutOfCore:
 
     """
 
-    def __init__(self, policy: Speculation, me: DomainRank, tree: RayTree) -> None:
+    def __init__(self, policy: Speculation, me: DomainRank, tree: RayTree, blocking: Blocking) -> None:
         frame = me.frame
         self.policy, self.me, self.tree, self.counters = policy, me, tree, frame.counters
         depth = policy.history_depth or bounces(frame.trace.integrator)
         samples = frame.trace.pixels * frame.trace.samples
         buffer = me.alike(lambda: np.full((samples, depth), np.inf, np.float32))
-        pixels = np.flatnonzero(frame.rank_of_pixel == me.index)
-        mine = (pixels + frame.trace.pixels * np.arange(frame.trace.samples)[:, None]).ravel()
-        self.hbuf = HistoryBuffer(tree, buffer, mine)
+        self.hbuf = HistoryBuffer(tree, buffer)
+        self.camera_rays = me.camera_rays()
+        self.tile = blocking.tile
         self.flags = me.alike(lambda: Flags(tree))
         self.rq, self.sq_in, self.sq_out = (DomainQueues(frame.domains.count) for _ in range(3))
         self.statistics = np.zeros(frame.domains.count, np.int64)
@@ -124,16 +146,19 @@ class OutOfCore:
         self.born: list[Ids] = []
         self.alive = 0
         self.ray_bytes = policy.ray_bytes or 64.0 + 4.0 * depth
-        self.buffer_bytes = 4.0 * depth * len(mine)
+        self.rounds = 0
 
-    def spray(self) -> Steps:
-        """Render the rank's part of the image (listing 2)."""
-        me, ray_depth, rounds = self.me, 0, 0
-        self.domain_queuing(me.camera_rays())
+    def spray(self, tile: int) -> Steps:
+        """Render the rank's part of a tile (listing 2)."""
+        me, ray_depth = self.me, 0
+        samples = self.samples(tile)
+        self.buffer_bytes = 4.0 * self.hbuf.depth * len(samples)
+        rays = self.camera_rays
+        self.domain_queuing(rays[self.tile[me.frame.trace.column("pixel")[rays]] == tile])
         while True:
             spilled, self.spill_rq = joined(self.spill_rq), []
             self.domain_queuing(spilled[self.hbuf.visibility(spilled)])
-            self.hbuf.reset(ray_depth)
+            self.hbuf.reset(ray_depth, samples)
             while self.rq.any() or self.sq_in.any() or self.retire_sq:
                 for domain in self.schedule():
                     if not any(queues.counts[domain] for queues in (self.rq, self.sq_in, self.sq_out)):
@@ -156,12 +181,19 @@ class OutOfCore:
                 self.retire()
                 self.retire_sq, self.commit_sq = self.commit_sq, []
                 self.sq_in, self.sq_out = self.sq_out, self.sq_in
-                rounds += 1
+                self.rounds += 1
             self.settle()
             ray_depth += self.hbuf.depth
             if not self.spill_rq:
                 break
-        self.counters.rounds = max(self.counters.rounds, rounds)
+        self.counters.rounds = max(self.counters.rounds, self.rounds)
+
+    def samples(self, tile: int) -> Ids:
+        """Return the samples of this rank's part of a tile."""
+        frame = self.me.frame
+        pixels = np.flatnonzero((frame.rank_of_pixel == self.me.index) & (self.tile == tile))
+        samples: Ids = (pixels + frame.trace.pixels * np.arange(frame.trace.samples)[:, None]).ravel()
+        return samples
 
     def domain_queuing(self, rays: Ids) -> None:
         """Queue radiance rays for all domains that they enter, and count them (listing 2, lines 3 and 8)."""
@@ -235,7 +267,7 @@ class OutOfCore:
         self.domain_queuing(rs[~deep])
         if len(ss) == 0:
             return
-        here = np.full(len(ss), domain)
+        here = np.full(len(ss), domain, np.int16)
         birth = rows_in(ss, here, tree.rays["first"], tree.rays["last"], tree.rows["domain"])
         enters = birth >= 0
         self.flags.occluded[ss[enters]] = tree.hits(birth[enters]) < np.inf

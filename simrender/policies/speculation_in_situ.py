@@ -12,6 +12,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from simrender.policies.blocking import Blocking
 from simrender.policies.domain_frame import DomainFrame, Steps
 from simrender.policies.domain_rank import DomainRank
 from simrender.policies.history import bounces, check_lit, rows_in, shadow_rays
@@ -107,6 +108,7 @@ class InSitu:
     ----------
     frame : DomainFrame
     tree : RayTree
+    blocking : Blocking
     ray_bytes : float or None
     header_bytes : float
     cached_first : bool
@@ -115,25 +117,30 @@ class InSitu:
     Attributes
     ----------
     tbuf_bytes, obuf_bytes : float
-        Of the buffers that every rank holds for all samples, as published.
+        Of the buffers that every rank holds for all samples of a tile, as published.
 
     """
 
     def __init__(
-        self, frame: DomainFrame, tree: RayTree, ray_bytes: float | None, header_bytes: float, cached_first: bool
+        self,
+        frame: DomainFrame,
+        tree: RayTree,
+        blocking: Blocking,
+        ray_bytes: float | None,
+        header_bytes: float,
+        cached_first: bool,
     ) -> None:
         assert frame.owner is not None  # noqa: S101 - domains stay with ranks
         self.frame, self.tree, self.owner, self.cached_first = frame, tree, frame.owner, cached_first
+        self.blocking = blocking
         self.max_depth = bounces(frame.trace.integrator)
         self.ray_bytes, self.header_bytes = ray_bytes or DEFAULT_RAY_BYTES, header_bytes
-        samples = float((frame.rank_of_pixel >= 0).sum()) * frame.trace.samples * frame.weight
-        self.tbuf_bytes = 4.0 * samples
-        self.obuf_bytes = 4.0 * float(np.ceil(samples * shadow_rays(tree) / 32.0))
+        self.tbuf_bytes = self.obuf_bytes = 0.0
 
-    def spray(self, me: DomainRank) -> Steps:
-        """Render the frame as one of the ranks (listing 5)."""
+    def spray(self, me: DomainRank, tile: int) -> Steps:
+        """Render a tile as one of the ranks (listing 5)."""
         ray_depth = 0
-        batch = me.alike(self.camera_rays)
+        batch = me.alike(lambda: self.camera_rays(tile))
         while True:
             work = yield from me.allreduce(self.work_counter(me.index, batch))
             if not work.any():
@@ -142,7 +149,7 @@ class InSitu:
                        tuple(np.unique(batch.domain).tolist()), together=True)  # fmt: skip
             me.count_step()
             yield from self.send_and_receive(me, batch)
-            done = me.alike(lambda: self.process(batch, ray_depth))  # noqa: B023 - called at once
+            done = me.alike(lambda: self.process(batch))  # noqa: B023 - called at once
             tests = done.radiance + done.shadow
             for domain in me.owned[tests[me.owned] > 0].tolist():
                 radiance, shadow = int(done.radiance[domain]), int(done.shadow[domain])
@@ -157,13 +164,18 @@ class InSitu:
             batch = me.alike(lambda: self.resolve_visibility(batch, done))  # noqa: B023
             me.next_step()
             ray_depth += 1
-        self.frame.counters.rounds = ray_depth
+        if me.index == 0:
+            self.frame.counters.rounds += ray_depth
 
-    def camera_rays(self) -> Batch:
-        """Queue all camera rays (listing 5, line 4)."""
-        trace = self.frame.trace
-        rank = self.frame.rank_of_pixel[trace.column("pixel")[: trace.first[1]]]
-        rays = np.flatnonzero(rank >= 0)
+    def camera_rays(self, tile: int) -> Batch:
+        """Queue all camera rays of a tile, for which there are buffers now (listing 5, line 4)."""
+        trace, rank_of_pixel = self.frame.trace, self.blocking.rank
+        mine = (rank_of_pixel >= 0) & (self.blocking.tile == tile)
+        samples = float(mine.sum()) * trace.samples * self.frame.weight
+        self.tbuf_bytes = 4.0 * samples
+        self.obuf_bytes = 4.0 * float(np.ceil(samples * shadow_rays(self.tree) / 32.0))
+        pixel = trace.column("pixel")[: trace.first[1]]
+        rank, rays = rank_of_pixel[pixel], np.flatnonzero(mine[pixel])
         nowhere, none = np.full(len(rays), -1, np.int64), np.zeros(0, np.int64)
         return self.blocks(
             self.domain_queuing(rays, rank[rays], nowhere, np.full(len(rays), np.inf, np.float32)),
@@ -226,7 +238,7 @@ class InSitu:
         for event in leaving:  # noqa: UP028 - SimPy's events are no generators
             yield event
 
-    def process(self, batch: Batch, ray_depth: int) -> Processed:  # noqa: ARG002
+    def process(self, batch: Batch) -> Processed:
         """Query the domains for all rays, shade the hits that are nearest on a rank so far (listing 6)."""
         tree, domains, counters = self.tree, self.frame.domains.count, self.frame.counters
         queued, shadow = batch.radiance, batch.shadow

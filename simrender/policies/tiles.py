@@ -37,7 +37,7 @@ class TiledFrame:
     first : int64 array (tiles + 1,)
         Where each tile's packets begin.
     pixels : int64 array (packets,)
-        Published pixels for which a packet stands; they sum to those of the image.
+        Published pixels for which a packet stands, at least one each; they sum to those of the image.
     seconds : float64 array (packets,)
         What one core of the processor takes for a packet's rays.
     streams : (Stream, Stream)

@@ -67,9 +67,7 @@ class Entered:
     entry: F32
 
 
-def enter_boxes(
-    origin: F32, direction: F32, reach: F32, low: F32, high: F32, *, growth: float = SLACK
-) -> Entered:
+def enter_boxes(origin: F32, direction: F32, reach: F32, low: F32, high: F32, *, growth: float = SLACK) -> Entered:
     """Find the boxes that rays enter, front to back.
 
     Boxes are closed and may overlap, be flat, or be empty (inside out: never entered). A ray enters a box that it

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from simrender.errors import SceneError
@@ -10,6 +12,7 @@ from simrender.rays.domains import Domains
 from simrender.rays.files import SceneFile
 from simrender.rays.partition import Footprint, Published, partition, pieces
 from simrender.rays.scene import Scene
+from simrender.rays.volume import MACRO
 from simrender.rays.workload_card import DomainsCard, PublishedCard
 
 NO_FOOTPRINT = Footprint(0.0, 0.0)
@@ -89,7 +92,8 @@ def _parts(scene: Scene, how: DomainsCard, card: PublishedCard, published: Publi
     low, high = elements.part_bounds
     sizes = np.bincount(elements.part, minlength=len(low)).astype(np.float64)
     share = sizes / sizes.sum()
-    return Domains(low, high, share * published.geometry_bytes, share * float(card.elements or sizes.sum()))
+    count = float(card.elements or sizes.sum()) * card.growth
+    return Domains(low, high, share * published.geometry_bytes, share * count)
 
 
 def _bricks(scene: Scene, count: int, card: PublishedCard) -> Domains:
@@ -97,7 +101,11 @@ def _bricks(scene: Scene, count: int, card: PublishedCard) -> Domains:
     if volume is None:
         raise SceneError("domains.method kd_bricks: the scene has no volume; use sah, grid, balanced or objects")
     cells = cuts.kd_bricks(volume.dims, count)
-    found = cuts.from_bricks(volume, cells, card.voxels)
+    each = 4.0
+    if card.geometry_bytes is not None:
+        each = float(card.geometry_bytes) / float(np.prod(np.array(card.voxels or volume.dims, np.float64)))
+    found = cuts.from_bricks(volume, cells, card.voxels, each * card.growth)
+    found = replace(found, primitives=found.primitives * card.growth)
     if len(scene.instance_object) == 0:
         return found
     # Triangles in the volume go with the brick that holds their centre; the brick's box grows to hold them.
@@ -105,10 +113,10 @@ def _bricks(scene: Scene, count: int, card: PublishedCard) -> Domains:
     centre = 0.5 * (low.astype(np.float64) + high)
     grid = (centre - np.array(volume.origin)) / np.array(volume.spacing)
     cell = np.clip(np.floor(grid).astype(np.int64), 0, np.array(volume.cells) - 1)
-    owner = np.full(len(cell), -1, np.int32)
+    macro = np.zeros(tuple(-(-n // MACRO) for n in volume.cells), np.int32)
     for d, (x0, x1, y0, y1, z0, z1) in enumerate(cells.tolist()):
-        inside = (cell >= [x0, y0, z0]).all(axis=1) & (cell < [x1, y1, z1]).all(axis=1)
-        owner[inside] = d
+        macro[x0 // MACRO : -(-x1 // MACRO), y0 // MACRO : -(-y1 // MACRO), z0 // MACRO : -(-z1 // MACRO)] = d
+    owner = macro[tuple((cell // MACRO).T)]
     around = cuts.from_triangles(scene.triangles, owner, len(cells), 0.0, 0.0)
     return Domains(
         np.minimum(found.low, around.low), np.maximum(found.high, around.high), found.bytes, found.primitives, owner,

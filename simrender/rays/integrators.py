@@ -8,6 +8,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from simrender.rays.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -153,6 +157,17 @@ def in_units(integrator: Integrator, factor: float) -> Integrator:
     if isinstance(integrator, ElementMarching):
         return replace(integrator, step=integrator.step * factor)
     return integrator
+
+
+def most_children(integrator: Integrator, scene: Scene) -> int:
+    """Return how many rays a ray may spawn in a scene, at most."""
+    if isinstance(integrator, AmbientOcclusion):
+        return integrator.samples + (integrator.bounces > 1)
+    if isinstance(integrator, SprayPathTracing):
+        emitters = sum(any(scene.materials[mesh.material].emission) for mesh in scene.meshes)
+        wide = emitters + len(scene.hemispheres)
+        return integrator.shadow_samples * wide + len(scene.points) + (integrator.bounces > 1)
+    return {PathTracing: 2, VolumePathTracing: 1}.get(type(integrator), 0)
 
 
 INTEGRATORS: dict[str, type[Integrator]] = {

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
+from simrender.errors import SceneError
 from simrender.rays.integrators import AmbientOcclusion, SprayPathTracing
 from simrender.rays.kinds import DIFFUSE, SHADOW
 from simrender.rays.sampling import cosine_direction, offset_origin, path_key, uniform
@@ -20,6 +21,8 @@ from simrender.rays.shading import Surfaces, surface_point
 
 # Dimensions of the random numbers at a surface: two for the diffuse ray, then four a shadow ray.
 _DIRECTION, _SHADOWS = 0, 2
+
+_MOST = int(np.iinfo(np.uint16).max)
 
 
 def shade(
@@ -36,6 +39,8 @@ def shade(
         ambient, each, distance, shine = 0, light.shadow_samples, math.inf, (light.specular, light.shininess)
     wide = len(surfaces.light_first) - 1 + len(surfaces.hemispheres)
     most = ambient + each * wide + len(surfaces.points) + 1
+    if most > _MOST:
+        raise SceneError(f"{most:,} rays a hit are more than the {_MOST:,} that are counted; use fewer shadow samples")
     out: dict[str, Any] = {
         "origin": np.zeros((most * n, 3), np.float32),
         "direction": np.zeros((most * n, 3), np.float32),
@@ -50,7 +55,7 @@ def shade(
         rays["diffuse"], hits.primitive, hits.u, hits.v,
         surfaces.vertices, surfaces.faces, surfaces.normals, surfaces.colors, surfaces.material, surfaces.materials,
         surfaces.points, surfaces.hemispheres, surfaces.light_first, surfaces.light_rows,
-        ambient, each, distance, *shine, light.bounces, seed, *(light.program_image or (0, 0, 0)),
+        ambient, each, distance, *shine, light.bounces, np.uint64(seed), *(light.program_image or (0, 0, 0)),
         radiance, children, out["origin"], out["origin"].view(np.int32), out["direction"], out["throughput"],
         out["reach"], out["parent"], out["kind"],
     )  # fmt: skip

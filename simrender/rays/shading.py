@@ -102,7 +102,7 @@ def camera_rays(
     width, height = size
     origins = np.zeros((width * height, 3), np.float32)
     directions = np.zeros((width * height, 3), np.float32)
-    _camera_rays(camera, width, height, seed, sample, jitter, origins, directions)
+    _camera_rays(camera, width, height, np.uint64(seed), sample, jitter, origins, directions)
     return origins, directions
 
 
@@ -155,7 +155,7 @@ def shade(rays: dict[str, Any], hits: Any, surfaces: Surfaces, path: PathTracing
         rays["mirror"], hits.primitive, hits.u, hits.v,
         surfaces.vertices, surfaces.faces, surfaces.normals, surfaces.colors, surfaces.material, surfaces.materials,
         surfaces.sky, surfaces.points, surfaces.light_first, surfaces.light_rows,
-        path.diffuse, path.mirror, path.roulette, seed,
+        path.diffuse, path.mirror, path.roulette, np.uint64(seed),
         radiance, children, out["origin"], out["origin"].view(np.int32), out["direction"], out["throughput"],
         out["reach"], out["parent"], out["kind"],
     )  # fmt: skip

@@ -25,7 +25,8 @@ FORMAT_VERSION = 3
 
 _TRANSPORT = (
     "scene", "shading", "lighting", "sampling", "volume", "marching", "tracking", "volume_paths", "elements",
-    "element_marching", "compositing", "worlds", "crossings",
+    "element_marching", "compositing", "worlds", "crossings", "speculative",
+    "boxes", "trace", "embree",
 )  # fmt: skip
 """The modules that decide what is stored."""
 

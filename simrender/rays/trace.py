@@ -42,7 +42,7 @@ from numpy.typing import NDArray
 
 from simrender.errors import SceneWarning
 from simrender.rays import embree
-from simrender.rays.integrators import Integrator, in_units
+from simrender.rays.integrators import Integrator, in_units, most_children
 from simrender.rays.kinds import CAMERA, KINDS
 from simrender.rays.memory import check_memory
 from simrender.rays.precision import out_of_range
@@ -279,8 +279,8 @@ class Trace:
         return self.store.load(f"{generation:03d}-hits", self._outcome, expected)
 
     def _trace(self, generation: int) -> Columns:
-        if generation == 0:
-            self._check_memory()
+        expected = self.pixels * self.samples if generation == 0 else int(self._outcomes[-1]["children"].sum())
+        self._check_memory(expected)
         rays = self._first_rays() if generation == 0 else self._spawned_rays(generation)
         count = len(rays["kind"])
         report = partial(self._report, generation, count)
@@ -295,12 +295,12 @@ class Trace:
         embree.on_all_cores(lambda file: self.store.save(*file), files)
         return outcome
 
-    def _check_memory(self) -> None:
-        """Refuse what cannot fit, before it is begun: hierarchies, and camera rays with one child each."""
-        triangles, rays = self.scene.instanced_triangles, self.pixels * self.samples
+    def _check_memory(self, rays: int) -> None:
+        """Refuse what cannot fit, before it is begun: hierarchies, and a generation with as many children as may be."""
+        triangles, most = self.scene.instanced_triangles, most_children(self.integrator, self.scene)
         check_memory(
-            triangles * _TRIANGLE_BYTES + 2.0 * rays * _RAY_BYTES,
-            f"tracing {self.size[0]}x{self.size[1]} pixels, {self.samples} samples each, among {triangles:,} triangles",
+            triangles * _TRIANGLE_BYTES + (1.0 + most) * rays * _RAY_BYTES,
+            f"tracing {rays:,} rays, each of which may spawn {most}, among {triangles:,} triangles",
             "; a smaller workload.traced.resolution or fewer workload.traced.samples need less",
         )
 

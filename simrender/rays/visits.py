@@ -86,7 +86,7 @@ def visits(crossings: Crossings) -> Visits:
         shadow = trace.column("kind")[rays] == SHADOW
         t, mine = trace.column("t")[rays], near[rays]
         if not apart:
-            _ask_before(crossings, generation, np.flatnonzero(shadow & (mine >= 0)), mine)
+            _ask_before(crossings, generation, np.flatnonzero(shadow & (mine >= 0)), mine, birth)
         arguments = (table["first"], table["domain"], table["entry"], table["hit"], t, mine, birth, shadow)
         count = np.zeros(len(t) + 1, np.int64)
         back = np.zeros(len(t), np.bool_)
@@ -104,10 +104,12 @@ def visits(crossings: Crossings) -> Visits:
     return Visits(np.concatenate(firsts), np.concatenate(parts), np.concatenate(returns), near)
 
 
-def _ask_before(crossings: Crossings, generation: int, occluded: Ids, nearest: NDArray[np.int16]) -> None:
+def _ask_before(
+    crossings: Crossings, generation: int, occluded: Ids, nearest: NDArray[np.int16], birth: NDArray[np.int16]
+) -> None:
     """Let occluded shadow rays find the first domain that has something in their way, where boxes overlap."""
     table = crossings.table(generation)
-    rows = _rows_before(table["first"], table["domain"], occluded, nearest)
+    rows = _rows_before(table["first"], table["domain"], occluded, nearest, birth)
     crossings.hits(generation, rows)
 
 
@@ -133,23 +135,22 @@ def _none_overlap(low, high):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _rows_before(first, domain, rays, nearest):  # type: ignore[no-untyped-def]
-    """Return the rows of rays that come before that of their nearest hit."""
-    count = 0
-    for ray in rays:
-        for row in range(first[ray], first[ray + 1]):
-            if domain[row] == nearest[ray]:
-                break
-            count += 1
-    rows = np.empty(count, np.int64)
-    count = 0
-    for ray in rays:
-        for row in range(first[ray], first[ray + 1]):
-            if domain[row] == nearest[ray]:
-                break
-            rows[count] = row
-            count += 1
-    return rows
+def _rows_before(first, domain, rays, nearest, birth):  # type: ignore[no-untyped-def]
+    """Return the rows of rays that come before that of their nearest hit, and those of the domains of their birth."""
+    found = np.empty(0, np.int64)
+    for fill in (False, True):
+        count = 0
+        for ray in rays:
+            before = True
+            for row in range(first[ray], first[ray + 1]):
+                before = before and domain[row] != nearest[ray]
+                if before or domain[row] == birth[ray]:
+                    if fill:
+                        found[count] = row
+                    count += 1
+        if not fill:
+            found = np.empty(count, np.int64)
+    return found
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -169,6 +170,10 @@ def _visit(first, domain, entry, hit, t, nearest, birth, shadow, count, out, ret
             last = birth[i]
             met = met or birth[i] == nearest[i]
             stopped = birth[i] == nearest[i] and shadow[i]
+            if shadow[i] and nearest[i] >= 0:
+                for row in range(first[i], first[i + 1]):
+                    if domain[row] == birth[i] and hit[row] < np.inf:
+                        met = stopped = True
         for row in range(first[i], first[i + 1]):
             if stopped or domain[row] == birth[i]:
                 continue

@@ -43,7 +43,7 @@ _OFF_ISOSURFACE = 1e-3
 def tracking_keys(rays: Columns, seed: int) -> NDArray[np.uint64]:
     """Return the key of each ray's free flight, uint64 (n,): of its path, its depth, and whether it looks for light."""
     keys = np.zeros(len(rays["kind"]), np.uint64)
-    _tracking_keys(seed, rays["pixel"], rays["sample"], rays["kind"], rays["diffuse"], keys)
+    _tracking_keys(np.uint64(seed), rays["pixel"], rays["sample"], rays["kind"], rays["diffuse"], keys)
     return keys
 
 
@@ -127,7 +127,7 @@ def scatter(
     spawned = _scatter(
         rays["direction"], rays["throughput"], rays["pixel"], rays["sample"], rays["kind"], rays["diffuse"],
         event, point, normal, albedo, emitted, sky_row(scene.environment), np.array(points, np.float64).reshape(-1, 7),
-        light.bounces, light.shadow_probability, light.roulette, seed, radiance, children,
+        light.bounces, light.shadow_probability, light.roulette, np.uint64(seed), radiance, children,
         out["origin"], out["origin"].view(np.int32), out["direction"], out["throughput"], out["reach"], out["parent"],
         out["kind"],
     )  # fmt: skip

@@ -217,7 +217,14 @@ class Workload:
 
     @property
     def _usual_domains(self) -> DomainsCard:
-        return DomainsCard() if self.scene.elements is not None else DomainsCard(method="auto", count=8)
+        if self.scene.elements is not None:
+            return DomainsCard()
+        count = 8
+        if self.scene.volume is not None:
+            from simrender.rays.volume import MACRO
+
+            count = min(count, math.prod(-(-cells // MACRO) for cells in self.scene.volume.cells))
+        return DomainsCard(method="auto", count=count)
 
     def domain_crossings(self, seed: int, domains: Domains) -> Crossings:
         """Return the crossing table of a trace and domains."""
@@ -227,6 +234,12 @@ class Workload:
 
             self._crossings[key] = Crossings(self.trace(seed), domains)
         return self._crossings[key]
+
+    def forget(self, seed: int) -> None:
+        """Let go of what is in memory of a trace; it stays on disk."""
+        self._traces.pop(seed, None)
+        for key in [key for key in self._crossings if key[0] == seed]:
+            del self._crossings[key]
 
     def visits(self, crossings: Crossings) -> Visits:
         """Return the domains that each ray of a complete trace visits without speculation."""

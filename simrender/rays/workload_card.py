@@ -32,8 +32,8 @@ def _size(text: Any) -> Any:
     return int(width), int(height)
 
 
-Resolution = Annotated[tuple[int, int], BeforeValidator(_size)]
 Whole = Annotated[int, Field(ge=1)]
+Resolution = Annotated[tuple[Whole, Whole], BeforeValidator(_size)]
 
 
 class PublishedCard(Card):

@@ -249,6 +249,11 @@ class _Backdrop:
         columns = ([getattr(p, name) for p in parts] for name in ("t", "primitive", "u", "v"))
         return embree.Hits(*(np.concatenate(column) for column in columns))
 
+    def in_front(self, rays: Columns) -> Columns:
+        """Return rays that end at the triangles behind the medium, as far as all ranks know them."""
+        hits = self.hits(rays)
+        return rays if hits is None else rays | {"reach": np.minimum(rays["reach"], hits.t)}
+
     def colors(self, rays: Columns, hits: embree.Hits | None) -> NDArray[np.float32]:
         """Return what each ray sees where nothing is in front, float32 (n, 3)."""
         from simrender.rays.shading import headlight
@@ -287,7 +292,7 @@ class MarchingWorld:
             ends = marched.done | (marched.rgba[:, 3] > 0.0)
             return {
                 "t": np.where(ends, marched.entry, reach if hits is None else hits.t).astype(np.float32),
-                "primitive": np.full(n, -1, np.int32) if hits is None else hits.primitive,
+                "primitive": np.full(n, -1, np.int32) if hits is None else np.where(ends, -1, hits.primitive),
                 "radiance": (part["throughput"] * seen).astype(np.float32),
                 "work": marched.samples.astype(np.uint32),
             }
@@ -297,7 +302,7 @@ class MarchingWorld:
 
     def cross(self, rays: Columns, ray: Ids, domains: Domains, domain: NDArray[np.int16], seed: int) -> Columns:  # noqa: ARG002
         """See `World`; a row is a fragment, which has ``rgba`` (float32 (n, 4), premultiplied), entry and exit."""
-        marched = self._march(rays, ray, bricks(domains, domain))
+        marched = self._march(self.backdrop.in_front(rays), ray, bricks(domains, domain))
         return {
             "hit": np.where(marched.done, marched.exit, np.float32(np.inf)),
             "work": marched.samples.astype(np.uint32),
@@ -384,10 +389,11 @@ class ElementWorld:
             rgba = composite(found.rgba, found.entry, owner, entered.domain[found.row], n)
             t = np.full(n, np.inf, np.float32) if hits is None else hits.t.copy()
             np.minimum.at(t, owner, found.entry)
+            ends = rgba[:, 3] > 0.0
             seen = rgba[:, :3] + (1.0 - rgba[:, 3:]) * self.backdrop.colors(some, hits)
             return {
                 "t": t,
-                "primitive": np.full(n, -1, np.int32) if hits is None else hits.primitive,
+                "primitive": np.full(n, -1, np.int32) if hits is None else np.where(ends, -1, hits.primitive),
                 "radiance": (some["throughput"] * seen).astype(np.float32),
                 "work": np.bincount(ray, found.elements, minlength=n).astype(np.uint32),
                 "samples": np.bincount(ray, found.samples, minlength=n).astype(np.uint32),
@@ -398,7 +404,7 @@ class ElementWorld:
 
     def cross(self, rays: Columns, ray: Ids, domains: Domains, domain: NDArray[np.int16], seed: int) -> Columns:  # noqa: ARG002
         """See `World`; domain d holds part d."""
-        found = self.fragments(rays, ray, domain)
+        found = self.fragments(self.backdrop.in_front(rays), ray, domain)
         hit = np.full(len(ray), np.inf, np.float32)
         np.minimum.at(hit, found.row, found.entry)
         return {"hit": hit, "work": found.elements.astype(np.uint32), "samples": found.samples.astype(np.uint32)}

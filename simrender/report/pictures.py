@@ -63,6 +63,9 @@ def domain_picture(trace: Trace, crossings: Crossings, group: NDArray[np.integer
 _NOTHING = 0.92
 """Brightness of the background."""
 
+_THIN = 0.4
+"""Power of the opacity that a thin medium is shown with."""
+
 
 def _surfaces(trace: Trace, crossings: Crossings, paint: F64) -> F64:
     """Return what each camera ray sees: the domain of its nearest hit, lit from the viewer where there is a normal."""
@@ -103,7 +106,8 @@ def _fragments(trace: Trace, domains: Domains, paint: F64, crossings: Crossings)
     count = trace.first[1]
     ray = np.repeat(np.arange(count), np.diff(table["first"]))
     if isinstance(trace.integrator, ElementMarching):
-        found = world.fragments(rays, ray, table["domain"])  # type: ignore[attr-defined]
+        in_front = world.backdrop.in_front(rays)  # type: ignore[attr-defined]
+        found = world.fragments(in_front, ray, table["domain"])  # type: ignore[attr-defined]
         rgba, entry, owner, domain = found.rgba, found.entry, ray[found.row], table["domain"][found.row]
     else:
         made = world.cross(rays, ray, domains, table["domain"], trace.seed)
@@ -111,8 +115,17 @@ def _fragments(trace: Trace, domains: Domains, paint: F64, crossings: Crossings)
     # The fragment keeps its opacity and its brightness, and takes its domain's hue.
     brightness = rgba[:, :3].max(axis=1, keepdims=True)
     tinted = np.concatenate([paint[domain] * (0.35 * rgba[:, 3:] + 0.65 * brightness), rgba[:, 3:]], axis=1)
-    image = composite(tinted.astype(np.float32), entry, owner, domain, count)
-    return np.asarray(image[:, :3] + (1.0 - image[:, 3:]) * _NOTHING, np.float64)
+    image = composite(tinted.astype(np.float32), entry, owner, domain, count).astype(np.float64)
+    behind = np.full((count, 3), _NOTHING)
+    hits = world.backdrop.hits(rays)  # type: ignore[attr-defined]
+    if hits is not None and domains.domain_of_triangle is not None:
+        on = np.flatnonzero(hits.primitive >= 0)
+        behind[on] = paint[domains.domain_of_triangle[hits.primitive[on]]]
+    # A thin medium would leave no more than a breath of colour.
+    opacity = image[:, 3:]
+    shown = opacity**_THIN
+    tint = image[:, :3] / np.where(opacity > 0.0, opacity, 1.0)
+    return np.asarray(tint * shown + (1.0 - shown) * behind, np.float64)
 
 
 def work_of_pixels(trace: Trace, crossings: Crossings) -> tuple[F64, str]:

@@ -144,7 +144,11 @@ def describe_estimates(estimates: dict[str, Estimate]) -> RenderableType:
     """Return a table of what replicas say of the sampling error."""
     some = next(iter(estimates.values()))
     table = _table("as published", "mean", f"{some.confidence:.0%} interval", "relative")
+    of_domains = [name for name in estimates if name.startswith("rays that enter")]
+    fullest = sorted(of_domains, key=lambda name: -float(estimates[name].mean))[:SHOWN_DOMAINS]
     for name, found in estimates.items():
+        if name in of_domains and name not in fullest:
+            continue
         kind = name.split()[0]
         if kind in KINDS[1:] and float(estimates[f"{kind} rays"].mean) == 0.0:
             continue  # there are none of this kind
@@ -163,9 +167,7 @@ def replica_counts(workload: Workload, trace: Trace, crossings: Crossings) -> di
     entered = np.zeros(crossings.domains.count)
     for generation in range(trace.generations):
         entered += np.bincount(crossings.table(generation)["domain"], minlength=len(entered))
-    counts |= {
-        f"rays that enter domain {d}": float(entered[d]) * scale for d in range(min(len(entered), SHOWN_DOMAINS))
-    }
+    counts |= {f"rays that enter domain {d}": float(entered[d]) * scale for d in range(len(entered))}
     counts["mean radiance"] = float(trace.image().mean())
     return counts
 

@@ -197,7 +197,7 @@ def test_fewer_misses_with_more_cache_and_a_warm_one(layers):
         result = run(layers, nodes=9, cache=cache, static=1.0, blocks="full")
         rates.append(result.miss_rate)
         cold.append(result.cold.miss_rate)
-        assert result.miss_rate < (0.7 if cache != "15%" else 1.0) * result.cold.miss_rate
+        assert result.miss_rate < result.cold.miss_rate
     assert rates == sorted(rates, reverse=True)
     assert cold == sorted(cold, reverse=True)
     assert rates[-1] == 0.0  # 1/1 has a line for every block
@@ -245,13 +245,14 @@ def test_scaled_blocks_are_as_many_as_the_weight_says():
     assert _block_sizes(whole, whole.trace(1), DistributedCache()) == (254, 226)
 
 
-def test_groups_of_gets_cost_about_what_single_ones_do(garden):
+@pytest.mark.parametrize(("threads", "error"), [(1, 0.01), (8, 0.15)])
+def test_groups_of_gets_cost_about_what_single_ones_do(garden, threads, error):
     for cache in ("70%", "100%"):
-        times = [
-            seconds(run(garden, cache=cache, display=False, warm_up=0, fetches=fetches, static=1.0, tile=16))[0]
-            for fetches in ("grouped", "single")
-        ]
-        assert times[0] == pytest.approx(times[1], rel=0.2)
+        parameters = {"cache": cache, "threads": threads, "display": False, "warm_up": 0, "static": 1.0, "tile": 16}
+        grouped, single = (run(garden, fetches=fetches, **parameters) for fetches in ("grouped", "single"))
+        assert seconds(grouped)[0] == pytest.approx(seconds(single)[0], rel=error)
+        if threads == 1:
+            assert grouped.frames[0].traced_misses == single.frames[0].traced_misses
 
 
 # What holds a frame back (figure 6 of the paper)

@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simrender.errors import InvariantError
+from simrender.policies.blocking import equal_tiles, program_tiles
 from simrender.policies.history import HistoryBuffer, bounces, check_lit
 from simrender.policies.load_any_once import LoadAnyOnce
 from simrender.policies.speculation import Speculation
@@ -158,6 +159,7 @@ POLICIES = st.builds(
     st.sampled_from(["out_of_core", "in_situ"]),
     cache=st.integers(1, 14),
     history_depth=st.sampled_from([None, 1, 2, 3, 4, 5]),
+    tiles=st.sampled_from([1, 2, 5]),
     like_program=st.booleans(),
 )
 
@@ -282,6 +284,38 @@ def test_ranks_without_domains_or_lines_idle():
     check_image(play(Speculation(), figure2(), 7))
 
 
+@pytest.mark.parametrize("data", ["out_of_core", "in_situ"])
+def test_tiles_take_less_memory_and_more_work(data):
+    crossings = wavelets(*SMALL)
+    whole, parts = (play(Speculation(data, cache=8, tiles=count), crossings, 2) for count in (1, 4))
+    check_image(parts)
+    assert max(parts.peak_bytes) < 0.6 * max(whole.peak_bytes)
+    assert parts.counters.visits > whole.counters.visits
+    assert parts.counters.rounds > whole.counters.rounds
+    # Combined in parts, the buffers are as large together.
+    assert parts.counters.tbuf_bytes == whole.counters.tbuf_bytes
+    assert parts.counters.sent_rays == whole.counters.sent_rays
+
+
+def test_each_rank_has_an_equal_share_of_each_tile():
+    rank = np.array([1, 1, 0, 0, 0, 0, -1, 1, 1, 2])
+    assert equal_tiles(rank, 2).tile.tolist() == [0, 0, 0, 0, 1, 1, 0, 1, 1, 0]
+    assert equal_tiles(rank, 1).tile.tolist() == [0] * 10
+
+
+def test_the_program_cuts_stripes_upright_out_of_core_and_tiles_of_a_million_samples():
+    found = program_tiles((7, 4), 1.0, 3, in_situ=False)
+    assert found.rank.reshape(4, 7)[0].tolist() == [0, 0, 1, 1, 2, 2, 2]
+    assert (found.tiles, found.tile.any()) == (1, False)
+    found = program_tiles((8, 4), 2.0**17, 2, in_situ=False)  # half a million samples a column
+    assert found.tile.reshape(4, 8)[:, 0].tolist() == [1, 1, 0, 0]
+    assert found.tiles == 2
+    found = program_tiles((8, 8), 2.0**17, 2, in_situ=True)  # a million samples a line
+    assert found.tile.reshape(8, 8)[:, 0].tolist() == [3, 3, 2, 2, 1, 1, 0, 0]
+    assert found.rank.reshape(8, 8)[:, 0].tolist() == [1, 0] * 4
+    assert program_tiles((512, 512), 4.0, 1, in_situ=False).tiles == 1
+
+
 # The history buffer
 
 
@@ -293,7 +327,7 @@ def test_the_history_buffer_takes_nearer_hits_and_forgets_what_came_of_farther_o
     near, middle, far = tree.rows_of(np.array([ray])).tolist()
     hits = tree.hits(np.array([near, middle, far]))
     assert (np.diff(hits) > 0).all()
-    buffer = HistoryBuffer(tree, np.full((crossings.trace.rays, 2), np.inf, np.float32), np.arange(8 * 6))
+    buffer = HistoryBuffer(tree, np.full((crossings.trace.rays, 2), np.inf, np.float32))
     assert buffer.farther_than(np.array([far])).tolist() == [True]
     assert buffer.update(np.array([far])).tolist() == [True]
     children, count = tree.children(np.array([far]))
@@ -304,8 +338,8 @@ def test_the_history_buffer_takes_nearer_hits_and_forgets_what_came_of_farther_o
     assert buffer.farther_than(np.array([near, far])).tolist() == [True, False]
     assert buffer.update(np.array([near])).tolist() == [True]
     assert buffer.buffer[ray].tolist() == [hits[0], np.inf]
-    buffer.reset(2)
-    assert np.isinf(buffer.buffer[: 8 * 6]).all()
+    buffer.reset(2, np.array([ray]))
+    assert np.isinf(buffer.buffer[ray]).all()
 
 
 def test_light_that_something_occludes_is_no_light():
@@ -314,6 +348,8 @@ def test_light_that_something_occludes_is_no_light():
     check_lit(tree, np.array([4]))
     with pytest.raises(InvariantError, match="the light of shadow ray 3 was added, and something is in its way"):
         check_lit(tree, np.array([4, 3]))
+    with pytest.raises(InvariantError, match="the light of shadow ray 5 was added, and a wrong hit spawned it"):
+        check_lit(tree, np.array([4, 5]))
 
 
 def test_paths_have_as_many_hits_as_their_integrator_allows():

@@ -5,10 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from simrender.rays.crossings import Crossings
+from simrender.rays.data import cut
+from simrender.rays.files import SceneFile
 from simrender.rays.integrators import PathTracing, VolumeMarching, VolumePathTracing
+from simrender.rays.partition import Published
 from simrender.rays.scene import IDENTITY, Environment, Material, Mesh, Scene, SceneObject
 from simrender.rays.trace import Trace
 from simrender.rays.volume import TransferFunction, Volume
+from simrender.rays.workload_card import DomainsCard, PublishedCard
 
 BLACK = Environment((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 DOWN = np.array([[0.0, 0.0, 5.0], [0.0, 0.0, -1.0], [0.4, 0.0, 0.0], [0.0, 0.4, 0.0]])
@@ -30,9 +35,7 @@ def plate(z: float, emission: float) -> Scene:
 
 
 def with_volume(scene: Scene, volume: Volume) -> Scene:
-    return Scene(
-        scene.objects, scene.instance_object, scene.instance_transform, scene.materials, (), BLACK, (), volume
-    )
+    return Scene(scene.objects, scene.instance_object, scene.instance_transform, scene.materials, (), BLACK, (), volume)
 
 
 def traced(scene: Scene, integrator, tmp_path, size=(16, 16), samples=64) -> Trace:
@@ -64,14 +67,18 @@ def test_a_plate_in_front_hides_the_slab(tmp_path):
 def test_half_the_slab_in_front_of_a_plate_takes_half_the_samples(tmp_path):
     samples = {}
     for z in (-1.0, 1.0):
-        trace = traced(with_volume(plate(z, 1.0), slab(0.2, 0.5)), VolumeMarching(opacity_limit=1.0), tmp_path, samples=1)
+        trace = traced(
+            with_volume(plate(z, 1.0), slab(0.2, 0.5)), VolumeMarching(opacity_limit=1.0), tmp_path, samples=1
+        )
         samples[z] = int(trace.column("work").sum())
     assert samples[1.0] == pytest.approx(samples[-1.0] / 2, rel=0.08)
 
 
 def test_marching_blends_the_medium_over_what_is_behind(tmp_path):
     opacity, color = 0.5, 0.8
-    trace = traced(with_volume(plate(-1.0, 0.0), slab(opacity, color)), VolumeMarching(shading=False), tmp_path, (2, 2), 1)
+    trace = traced(
+        with_volume(plate(-1.0, 0.0), slab(opacity, color)), VolumeMarching(shading=False), tmp_path, (2, 2), 1
+    )
     seen = trace.image()
     through = 1.0 - seen / color  # the plate is black
     assert (through > (1.0 - opacity) ** (DEPTH * 1.15)).all()
@@ -92,3 +99,22 @@ def test_a_medium_that_scatters_all_light_and_a_white_plate_make_a_white_furnace
 def test_surfaces_alone_are_followed_as_if_there_were_no_volume(tmp_path):
     both = with_volume(plate(-1.0, 3.0), slab(0.5))
     assert (traced(both, PathTracing(), tmp_path, samples=2).image() == 3.0).all()
+
+
+@pytest.mark.parametrize("integrator", [VolumeMarching(opacity_limit=1.0), VolumePathTracing()])
+def test_domains_make_of_a_mixed_scene_what_the_whole_makes(integrator, tmp_path):
+    scene = with_volume(plate(1.0, 1.0), slab(0.2, 0.5))
+    trace = traced(scene, integrator, tmp_path, samples=1)
+    card, how = PublishedCard(resolution=(16, 16), samples=1), DomainsCard(method="kd_bricks", count=2)
+    published = Published(2.0, 1.0, 2.0, 100.0, 0.0)
+    crossings = Crossings(trace, cut(scene, how, card, published, SceneFile(scene), 1.0))
+    table = crossings.table(0)
+    hits = crossings.hits(0, np.arange(len(table["domain"])))
+    ray = np.repeat(np.arange(256), np.diff(table["first"]))
+    if isinstance(integrator, VolumeMarching):
+        assert np.bincount(ray, table["work"], minlength=256).tolist() == trace.column("work")[:256].tolist()
+        assert (trace.column("primitive")[:256] == -1).all()  # the medium is in front
+    else:
+        nearest = np.full(256, np.inf, np.float32)
+        np.minimum.at(nearest, ray, hits)
+        assert (nearest == trace.column("t")[:256]).all()
