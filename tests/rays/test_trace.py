@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from simrender.rays.integrators import PathTracing
 from simrender.rays.kinds import CAMERA, DIFFUSE, MIRROR, SHADOW
 from simrender.rays.scene import IDENTITY, Environment, Material, Mesh, PointLight, Scene, SceneObject
-from simrender.rays.integrators import PathTracing
 from simrender.rays.store import CacheWarning
 from simrender.rays.trace import Trace
 from tests.scenes import garden, garden_workload, grid, placed, sphere
