@@ -126,6 +126,8 @@ def compare(
         where = f"{runs}, run {row['run']}"
         if row["program"] not in PROGRAMS:
             raise UsageError(f"{where}: unknown program {row['program']!r} (known: {', '.join(PROGRAMS)})")
+        if row["shading"] == "AO" and row["program"].startswith("baseline"):
+            row["bounces"] = "1"  # whatever it was told: its ambient occlusion goes no further
         key = tuple(row[name] for name in ("scene", "shading", "resolution", "spp", "shadow_samples", "bounces"))
         if key not in workloads:
             workloads[key] = _workload(row, scene, cache, where)
