@@ -38,13 +38,13 @@ class FrameReport:
         From the frame before being complete to this one being so.
     frames_per_s : float
     published_rays : float
-    traced_references, traced_residents, traced_hits, traced_misses : int
-        References of packets to blocks, by outcome.
+    references, residents, hits, misses : int
+        Of packets to blocks, by outcome: a node has residents for good, and fetches what it misses.
     miss_rate : float
         Misses as a share of the references to blocks that a node does not have for good.
     touched_share : float
         Share of all blocks that some ray of the frame refers to.
-    published_gets, fetched_bytes : float
+    fetched_bytes : float
     tiles, requests, messages : int
         Tiles handed out, questions to the master, messages to the display.
     imbalance : float
@@ -59,13 +59,12 @@ class FrameReport:
     frame_time_s: float
     frames_per_s: float
     published_rays: float
-    traced_references: int
-    traced_residents: int
-    traced_hits: int
-    traced_misses: int
+    references: int
+    residents: int
+    hits: int
+    misses: int
     miss_rate: float
     touched_share: float
-    published_gets: float
     fetched_bytes: float
     tiles: int
     requests: int
@@ -92,12 +91,12 @@ class PathResult:
     memory : dict
         ``data_bytes`` (published, with the hierarchy), ``needed_bytes`` of a node and ``capacity_bytes``.
     blocks : dict
-        Traced blocks of nodes and of triangles, how many of either make a block, and the lines of the caches.
+        Blocks of nodes and of triangles, how many traced ones of either make a block, and the lines of the caches.
     frames_per_s : float or None
         Frames over the sum of their times.
     miss_rate : float or None
     cold : FrameReport or None
-        The first frame that was rendered to warm up.
+        The first frame that was rendered to warm up, where caches begin empty.
     frames : list of FrameReport
     links, sampling_error, uncalibrated, scope
         As of a `simrender.result.Result`.
@@ -156,7 +155,8 @@ def simulate_frames(
     workload : str or Workload
     policy : DistributedCache
     frames : int
-        From the beginning of the path to its end; one is at its beginning.
+        That count. They follow the policy's ``warm_up`` first ones of the ``path_frames`` of the workload's card; where
+        it does not say how many there are, they lead from the beginning of the path to its end.
     nodes : int, optional
         How many to use, all by default; the last one has the master and the display process, and renders nothing.
     seed : int
@@ -177,15 +177,24 @@ def simulate_frames(
     count = check_processors(card, nodes, None)
     _check(card, workload, policy, frames, count)
     ranks = count - 1
-    workloads = [workload.frame(number, frames) for number in range(frames)]
-    traces = [each.trace(seed, progress) for each in workloads]
+    views, which = _views(workload, policy.warm_up, frames)
+    traces = [view.trace(seed, progress) for view in views]
     sizes = _block_sizes(workload, traces[0], policy)
     hierarchy = _Hierarchy(traces[0], sizes)
     refers = [references(trace, hierarchy, *sizes) for trace in traces]
     growth = float(workload.published.instanced_triangles) / refers[0].triangles
     data = growth * (refers[0].nodes * _NODE_BYTES + refers[0].triangles * _TRIANGLE_BYTES)
     share = _share(policy.cache, data)
-    lines = (0, 0) if policy.replicated else _lines(share, refers[0], ranks, policy)
+
+    env = simpy.Environment()
+    devices = Machine(env, card, count, record=True)
+    ray_seconds = _ray_seconds(devices, float(workload.published.instanced_triangles))
+    published = workload.card.published.resolution
+    tiled = [
+        tile_frame(trace, refer, published, policy.tile, ray_seconds, workload.repeats, policy.blocks == "scaled")
+        for trace, refer in zip(traces, refers, strict=True)
+    ]
+    lines = (0, 0) if policy.replicated else _lines(share, tiled[0].blocks, ranks, policy)
     capacity = float(card.processor.memory - card.processor.reserved_memory)
     display = card.display is not None if policy.display is None else policy.display
     facts: dict[str, Any] = {
@@ -198,8 +207,8 @@ def simulate_frames(
         "threads": policy.render_threads(card),
         "memory": {"data_bytes": data, "needed_bytes": share * data, "capacity_bytes": capacity},
         "blocks": {
-            "node_blocks": refers[0].node_blocks,
-            "triangle_blocks": refers[0].triangle_blocks,
+            "node_blocks": tiled[0].blocks[0],
+            "triangle_blocks": tiled[0].blocks[1],
             "nodes_a_block": sizes[0],
             "triangles_a_block": sizes[1],
             "node_lines": lines[0],
@@ -210,30 +219,26 @@ def simulate_frames(
         cause = {"modelled": ["what each node keeps of the data"], "left_out": []}
         return PathResult(**facts, feasible=False, scope=cause)
 
-    env = simpy.Environment()
-    devices = Machine(env, card, count, record=True)
-    ray_seconds = _ray_seconds(devices, float(workload.published.instanced_triangles))
-    published = workload.card.published.resolution
-    tiled = [
-        tile_frame(trace, refer, published, policy.tile, ray_seconds, workload.repeats)
-        for trace, refer in zip(traces, refers, strict=True)
-    ]
     sink = Display(env, card.display, published[0] * published[1]) if display and card.display else None
-    rendered = [tiled[0]] * policy.warm_up + tiled
-    cluster = Cluster(env, devices, policy, rendered, lines, sink)
-    last = [] if sink is None else [sink.complete(len(rendered) - 1)]
-    env.run(env.all_of([*(env.process(policy.node(RenderNode(cluster, rank))) for rank in range(ranks)), *last]))
+    cluster = Cluster(env, devices, policy, [tiled[k] for k in which], lines, sink)
+    last = [] if sink is None else [sink.complete(len(which) - 1)]
+    rendering = [RenderNode(cluster, rank) for rank in range(ranks)]
+    if policy.settled and not policy.replicated:
+        first = tiled[0]
+        uses = [s.last_uses(first.first, blocks) for s, blocks in zip(first.streams, first.blocks, strict=True)]
+        for node in rendering:
+            node.settle(first, uses, np.random.default_rng((seed, node.rank)))
+    env.run(env.all_of([*(env.process(policy.node(node)) for node in rendering), *last]))
 
-    images, hashes = _images(traces, tiled, cluster.counts[policy.warm_up :])
-    which = [0] * policy.warm_up + list(range(frames))
+    images, hashes = _images([traces[k] for k in which], [tiled[k] for k in which], cluster.counts)
     weight = workload.weight * workload.repeats
     ends = [0, *(counts.complete_at for counts in cluster.counts)]
     reports = [
-        _report(cluster, traces[k], refers[k], ends[i], cluster.counts[i], hashes[k], weight)
+        _report(cluster, traces[k], refers[k], ends[i], cluster.counts[i], hashes[i], weight)
         for i, k in enumerate(which)
     ]
     measured = reports[policy.warm_up :]
-    asked = sum(report.traced_hits + report.traced_misses for report in measured)
+    asked = sum(report.hits + report.misses for report in measured)
     used = [*devices.quantities(), *workload.card.quantities("workload.")]
     if sink is not None and card.display is not None:
         used += card.display.quantities("machine.display.")
@@ -241,17 +246,30 @@ def simulate_frames(
         **facts,
         feasible=True,
         frames_per_s=frames / sum(report.frame_time_s for report in measured),
-        miss_rate=sum(report.traced_misses for report in measured) / max(asked, 1),
-        cold=reports[0] if policy.warm_up else None,
+        miss_rate=sum(report.misses for report in measured) / max(asked, 1),
+        cold=reports[0] if policy.warm_up and not policy.settled else None,
         frames=measured,
         links=links(devices),
         sampling_error=rays_error(traces[0], published),
         uncalibrated=owned_up(used),
         scope=_scope(policy, sink),
         event_log_sha256=cluster.timeline.sha256(),
-        images=images,
+        images=images[policy.warm_up :],
         spans=cluster.timeline,
     )
+
+
+def _views(workload: Workload, warm_up: int, frames: int) -> tuple[list[Workload], list[int]]:
+    """Return what the camera sees, and which of it each frame shows: those to warm up, then those that count."""
+    camera = workload.card.camera
+    if len(camera.path) < 2:
+        numbers = [0] * (warm_up + frames)
+    elif camera.path_frames is None:
+        numbers = [0] * warm_up + list(range(frames))
+    else:
+        numbers = list(range(warm_up + frames))
+    of = max(numbers[-1] + 1, camera.path_frames or 0)
+    return [workload.frame(number, of) for number in range(numbers[-1] + 1)], numbers
 
 
 class _Hierarchy:
@@ -284,12 +302,6 @@ def _check(card: MachineCard, workload: Workload, policy: DistributedCache, fram
         raise UsageError(f"policy.display=true: {card.title} has no section display; use policy.display=false")
     if card.display is not None and card.display.nodes > 1 and policy.display is not False:
         raise UsageError(f"{name} sends its pixels to one display node, and there are {card.display.nodes}")
-    if policy.fetches == "single" and workload.weight != 1.0:
-        (width, height), (w, h) = workload.card.published.resolution, workload.card.traced.resolution
-        raise UsageError(
-            f"policy.fetches=single simulates each get of a published packet, and {w}x{h} of {width}x{height} pixels "
-            f"are traced; use policy.fetches=grouped, or workload.traced.resolution={width}x{height}"
-        )
 
 
 def _block_sizes(workload: Workload, trace: Trace, policy: DistributedCache) -> tuple[int, int]:
@@ -323,12 +335,12 @@ def _share(cache: str, data: float) -> float:
     return share
 
 
-def _lines(share: float, refers: References, ranks: int, policy: DistributedCache) -> tuple[int, int]:
+def _lines(share: float, blocks: tuple[int, int], ranks: int, policy: DistributedCache) -> tuple[int, int]:
     """Return the lines of both caches: what a node keeps less what it has for good."""
     lines = []
-    for blocks in (refers.node_blocks, refers.triangle_blocks):
-        own = blocks // ranks
-        lines.append(round(share * blocks) - own)
+    for each in blocks:
+        own = each // ranks
+        lines.append(round(share * each) - own)
     if ranks == 1:
         raise UsageError(f"policy.cache={policy.cache}: a single render node has all data; use all, or more nodes")
     if min(lines) < 1:
@@ -377,13 +389,12 @@ def _report(
         frame_time_s=seconds,
         frames_per_s=1.0 / seconds,
         published_rays=trace.rays * weight,
-        traced_references=counts.residents + counts.hits + counts.misses,
-        traced_residents=counts.residents,
-        traced_hits=counts.hits,
-        traced_misses=counts.misses,
+        references=counts.residents + counts.hits + counts.misses,
+        residents=counts.residents,
+        hits=counts.hits,
+        misses=counts.misses,
         miss_rate=counts.misses / max(counts.hits + counts.misses, 1),
         touched_share=touched / (refers.node_blocks + refers.triangle_blocks),
-        published_gets=float(counts.gets),
         fetched_bytes=counts.fetched_bytes,
         tiles=counts.tiles,
         requests=counts.requests,
@@ -406,6 +417,11 @@ def _scope(policy: DistributedCache, sink: Display | None) -> dict[str, Any]:
         {"what": "what a hit in the cache costs", "why": "it is inside the trace rates"},
         {"what": "the processors of who owns a block", "why": "an RDMA get needs none of their time"},
         {"what": "shading", "why": "its cost is inside the trace rates"},
+        {
+            "what": "the critical section of the MPI library that all threads of a node go through",
+            "why": "nobody says how long a get is in it; were it all the time, frames that keep an eighth of boeing or "
+            "of rm-isosurface would take 1.6 times as long",
+        },
     ]
     if policy.fetches == "grouped":
         why = "frames of small cases took up to 15 % longer with them; policy.fetches=single has them"

@@ -366,7 +366,8 @@ def run(
     gpus
         Use only so many GPUs of those.
     frames
-        Along the camera's path, one after the other, under distributed_cache, whose caches stay warm.
+        How many to render along the camera's path under distributed_cache: so many in a row of the path_frames of the
+        workload's card, or, if that does not say how many there are, from the path's beginning to its end.
     tile
         auto: where speculation needs more memory than a node has, cut the image into as few tiles as fit.
     set_

@@ -8,7 +8,7 @@ it fetches in blocks of almost 8 KB into a direct-mapped cache (5.3), which stay
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
@@ -23,8 +23,7 @@ from simrender.hardware.cache import MISS, NODE_BLOCK_BYTES, TRIANGLE_BLOCK_BYTE
 from simrender.hardware.display import Display, message_layout
 from simrender.hardware.machine import Machine, MachineCard
 from simrender.hardware.storage import BlockFetcher
-from simrender.policies.tiles import TiledFrame
-from simrender.rays.blocks import PACKET_RAYS
+from simrender.policies.tiles import Stream, TiledFrame
 from simrender.timeline import KERNELS, KINDS, Timeline
 
 Steps = Generator[simpy.Event, Any, Any]
@@ -60,16 +59,20 @@ class DistributedCache:
     blocks : "scaled" or "full"
         The traced mesh stands for a larger one, and a traced ray for many. In blocks that are smaller by as much as
         there are fewer rays for each triangle, a packet of rays meets as many blocks as it would in the published
-        scene. Full blocks have 254 nodes or 226 triangles whatever they stand for.
+        scene; each of the packets and each of the blocks then stands for as many. Full blocks have 254 nodes or 226
+        triangles and stand for themselves.
     fetches : "grouped" or "single"
         Whether the gets of a thread's packets are one flow from one owner, as fast as one get after the other would be,
-        or each is simulated, with the locks of the cache's lines. The latter needs a workload that is traced at its
-        published resolution.
+        or each is simulated, with the locks of the cache's lines, which takes long.
     display : bool, optional
         Whether pixels go to the machine's display; by default if it has one.
+    settled : bool
+        Whether caches begin as a long look at the first frame leaves them: every node has rendered each of the tiles
+        that are dealt at some time, in an order of its own, and between them the ones it always begins with. Where
+        they begin empty they take hundreds of frames to get there, for dealt tiles come to another node each time.
     warm_up : int
-        How often the first frame is rendered before frames count; the first that does begins when these are complete.
-        Tiles that are dealt come to another node each time, so caches take many frames to settle.
+        How many frames are rendered before those that count; the first that does begins when these are complete.
+        After a long look, a camera that moves takes about ten frames to come to the misses that it goes on with.
 
     """
 
@@ -84,7 +87,8 @@ class DistributedCache:
     blocks: Literal["scaled", "full"] = "scaled"
     fetches: Literal["grouped", "single"] = "grouped"
     display: bool | None = None
-    warm_up: Annotated[int, Field(ge=0)] = 1
+    settled: bool = True
+    warm_up: Annotated[int, Field(ge=0)] = 8
 
     @property
     def replicated(self) -> bool:
@@ -121,7 +125,6 @@ class Work:
     ----------
     packets : list of int
     pixels : int
-        Published ones; of the packets, or a part of them where they stand for several published packets.
     seconds : float
         That one core takes.
     gets : int
@@ -142,13 +145,12 @@ class Work:
 
 @dataclass
 class FrameCounts:
-    """How much of everything there was in one frame, over all nodes; references and misses are traced ones.
+    """How much of everything there was in one frame, over all nodes.
 
     Attributes
     ----------
     residents, hits, misses : int
-    gets : int
-        Published ones, as are the bytes.
+        References to blocks, by outcome.
     fetched_bytes : float
     tiles, requests : int
         Tiles handed out; questions for another one.
@@ -166,7 +168,6 @@ class FrameCounts:
     residents: int = 0
     hits: int = 0
     misses: int = 0
-    gets: int = 0
     fetched_bytes: float = 0.0
     tiles: int = 0
     requests: int = 0
@@ -281,11 +282,10 @@ class RenderNode:
         self._slowness = cluster.machine.processor(rank).slowness
         self._caches = [DirectMappedCache(blocks, rank % blocks.ranks) for blocks in cluster.maps]
         self._queue: deque[int] = deque()
-        self._taken = 0  # published pixels of the first packet in the queue
         self._asking: simpy.Event | None = None
         self._unsent = [0] * self.threads
         self._number = -1
-        self._seen = (0, 0, 0)
+        self._seen = self._outcomes()
         self._fetchers = []
         if cluster.policy.fetches == "single" and not cluster.policy.replicated:
             hosts = [("host", r) for r in range(cluster.ranks)]
@@ -304,11 +304,30 @@ class RenderNode:
         yield cluster.env.timeout(to_ticks(float(cluster.machine.card.processor.launch_latency)))
         self._number, self._frame, self._counts = frame, cluster.frames[frame], cluster.counts[frame]
         packets = len(self._frame.pixels)
-        self._gets = np.zeros(packets, np.int64)
-        self._get_bytes = np.zeros(packets)
+        self._fetched = np.zeros(packets)
         self._owners: dict[int, NDArray[np.int64]] = {}
         self._over = False
         self._queue_tiles(cluster.begins_with(self._frame, self.rank))
+
+    def settle(self, frame: TiledFrame, last_uses: Sequence[Stream], order: np.random.Generator) -> None:
+        """Bring the caches to where they are after many frames that are all the same; see `DistributedCache`.
+
+        Parameters
+        ----------
+        frame : TiledFrame
+        last_uses : sequence of Stream
+            Of its tiles; see `Stream.last_uses`.
+        order : numpy.random.Generator
+            Of the tiles that are dealt.
+
+        """
+        own = self._cluster.begins_with(frame, self.rank)
+        dealt = np.arange(self._cluster.begins_with(frame, self._cluster.ranks - 1).stop, frame.tiles)
+        rounds = np.array_split(order.permutation(dealt), self._cluster.ranks)
+        tiles = np.concatenate([np.append(own, some) for some in rounds]).astype(np.int64)
+        for cache, stream in zip(self._caches, last_uses, strict=True):
+            cache.replay(stream.taken(tiles).block)
+        self._seen = self._outcomes()
 
     def together(self, threads: list[Steps]) -> simpy.Event:
         """Return what happens when all threads are done."""
@@ -317,7 +336,7 @@ class RenderNode:
 
     def end(self) -> None:
         """Count what the frame took."""
-        now = tuple(sum(getattr(c, name) for c in self._caches) for name in ("residents", "hits", "misses"))
+        now = self._outcomes()
         delta = [a - b for a, b in zip(now, self._seen, strict=True)]
         self._seen = now
         self._counts.residents += delta[0]
@@ -325,33 +344,26 @@ class RenderNode:
         self._counts.misses += delta[2]
         self._cluster.finish(self._number)
 
+    def _outcomes(self) -> tuple[int, ...]:
+        return tuple(sum(getattr(c, name) for c in self._caches) for name in ("residents", "hits", "misses"))
+
     # -- the two queues -------------------------------------------------------------------------------------------
 
     def take(self) -> Work | None:
         """Take packets from the node's queue; None if it is empty."""
-        frame, left = self._frame, self._cluster.policy.packets * PACKET_RAYS
-        if not self._queue:
+        frame, queue = self._frame, self._queue
+        if not queue:
             return None
-        packets, pixels, seconds, gets, nbytes, owner = [], 0, 0.0, 0, 0.0, self.rank
-        while left and self._queue:
-            packet, begin = self._queue[0], self._taken
-            size, due = int(frame.pixels[packet]), int(self._gets[packet])
-            some = min(left, size - begin)
-            seconds += float(frame.seconds[packet]) * (some / size)
-            if due:
-                issued = due * begin // size
-                new = due * (begin + some) // size - issued
-                if new and not gets:
-                    owners = self._owners[packet]
-                    owner = int(owners[(issued + new // 2) * len(owners) // due])
-                gets += new
-                nbytes += new * float(self._get_bytes[packet])
-            pixels, left, self._taken = pixels + some, left - some, begin + some
-            if self._taken == size:
-                self._queue.popleft()
-                self._taken = 0
-                packets.append(packet)
-        return Work(packets, pixels, seconds, gets, nbytes, owner)
+        packets = [queue.popleft() for _ in range(min(self._cluster.policy.packets, len(queue)))]
+        missing = [owner for packet in packets for owner in self._owners.get(packet, ())]
+        return Work(
+            packets,
+            sum(int(frame.pixels[packet]) for packet in packets),
+            sum(float(frame.seconds[packet]) for packet in packets),
+            len(missing),
+            sum(float(self._fetched[packet]) for packet in packets),
+            int(missing[len(missing) // 2]) if missing else self.rank,
+        )
 
     def ask(self) -> Steps:
         """Ask the master for another tile, or wait for it if another thread has asked; return whether to go on."""
@@ -388,28 +400,21 @@ class RenderNode:
         ):
             first, last = stream.first[begin], stream.first[end]
             refers, order = stream.block[first:last], self._order(stream.first[begin : end + 1] - first)
-            missed = order[cache.replay(refers[order]) == MISS]
+            missed = np.sort(order[cache.replay(refers[order]) == MISS])
             of = np.searchsorted(stream.first, missed + first, side="right") - 1
             owners.append(cache.blocks.owner(refers[missed].astype(np.int64)))
             packet_of.append(of)
-            count = np.bincount(of - begin, minlength=end - begin)
-            self._gets[begin:end] += count
-            self._get_bytes[begin:end] += count * float(nbytes)
-        misses = self._gets[begin:end]
-        self._get_bytes[begin:end] /= np.maximum(misses, 1)
-        order = np.argsort(np.concatenate(packet_of), kind="stable")
-        parts = np.split(np.concatenate(owners)[order], np.cumsum(misses)[:-1])
-        self._owners.update((begin + i, part) for i, part in enumerate(parts) if len(part))
-        self._gets[begin:end] = np.rint(misses * frame.weight).astype(np.int64)
+            self._fetched[begin:end] += np.bincount(of - begin, minlength=end - begin) * float(nbytes)
+        of = np.concatenate(packet_of)
+        by_packet = np.argsort(of, kind="stable")
+        missing, begins = np.unique(of[by_packet], return_index=True)
+        parts = np.split(np.concatenate(owners)[by_packet], begins)[1:]
+        self._owners.update(zip(missing.tolist(), parts, strict=True))
 
     def _order(self, first: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the order in which references of packets come, as threads that share a cache make them in turn.
-
-        A packet that stands for many is shared by all threads, which then refer to the same blocks.
-        """
-        each = self._cluster.policy.packets / self._frame.weight
-        run = max(1, round(each))
-        together = run * self.threads if each >= 1.0 else max(1, round(each * self.threads))
+        """Return the order in which references of packets come, as threads that share a cache make them in turn."""
+        run = self._cluster.policy.packets
+        together = run * self.threads
         references = np.arange(first[-1])
         if together == 1:
             return references
@@ -438,7 +443,6 @@ class RenderNode:
             end = int(cluster.env.now)
             counts.fetch_ticks[self.rank] += end - begin
             cluster.timeline.add(row, LOAD, begin, end, nbytes, 0.0)
-        counts.gets += work.gets
         counts.fetched_bytes += nbytes
         counts.packets += work.packets
         self._send(thread, work.pixels)
@@ -463,7 +467,6 @@ class RenderNode:
                 for block in stream.block[stream.first[packet] : stream.first[packet + 1]].tolist():
                     if (yield from fetcher.fetch(thread, block)) == MISS:
                         nbytes += fetcher.block_bytes
-                        self._counts.gets += 1
                 fetcher.release(thread)
         return nbytes
 

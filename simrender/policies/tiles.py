@@ -27,6 +27,30 @@ class Stream:
         rows = np.arange(first[-1]) + np.repeat(self.first[order] - first[:-1], length)
         return Stream(first, self.block[rows])
 
+    def last_uses(self, first: I64, blocks: int) -> Stream:
+        """Return, of each run of packets, the blocks it refers to in the order of their last references.
+
+        Whatever else a cache has seen, its lines are then the same as if all references had come: each has the last
+        block that belongs into it.
+
+        Parameters
+        ----------
+        first : int64 array (runs + 1,)
+            Where each run of packets begins.
+        blocks : int
+            How many there are.
+
+        """
+        ends = self.first[first]
+        last = np.empty(blocks, np.int64)
+        keep = np.empty(len(self.block), np.bool_)
+        for run in map(slice, ends[:-1], ends[1:]):
+            place = np.arange(run.start, run.stop)
+            last[self.block[run]] = place  # of the places of a block, the last one stays
+            keep[run] = last[self.block[run]] == place
+        before = np.concatenate([[0], np.cumsum(keep)])
+        return Stream(before[ends], self.block[keep])
+
 
 @dataclass(frozen=True, eq=False)
 class TiledFrame:
@@ -37,15 +61,15 @@ class TiledFrame:
     first : int64 array (tiles + 1,)
         Where each tile's packets begin.
     pixels : int64 array (packets,)
-        Published pixels for which a packet stands, at least one each; they sum to those of the image.
+        Published ones; they sum to those of the image.
     seconds : float64 array (packets,)
         What one core of the processor takes for a packet's rays.
     streams : (Stream, Stream)
         References to blocks of nodes, and of triangles.
+    blocks : (int, int)
+        How many there are of either.
     rays : list of int64 arrays
-        Ids of each packet's rays.
-    weight : float
-        Published packets for which a packet stands.
+        Ids of the traced rays of each packet; of the copies of a packet, the first one has them.
 
     """
 
@@ -53,8 +77,8 @@ class TiledFrame:
     pixels: I64
     seconds: NDArray[np.float64]
     streams: tuple[Stream, Stream]
+    blocks: tuple[int, int]
     rays: list[I64]
-    weight: float
 
     @property
     def tiles(self) -> int:
@@ -69,8 +93,14 @@ def tile_frame(
     side: int,
     ray_seconds: tuple[float, float],
     repeats: int,
+    scaled: bool,
 ) -> TiledFrame:
     """Cut a frame into square tiles, row-major from the top left; those at the right and lower edges may be smaller.
+
+    A traced packet comes as often as there are published packets for it. Where blocks are scaled, a traced block stands
+    for as many published ones, and each copy of a packet refers to one of them: nothing but lines of a cache that are
+    taken by chance would tell copies that share their blocks from one packet with all their weight, and these chances
+    average out in the published scene as they do among many small blocks.
 
     Parameters
     ----------
@@ -85,6 +115,8 @@ def tile_frame(
     repeats : int
         Published samples for which a traced one stands. Their compute counts; the blocks that they refer to are taken
         for those that the traced one has just brought in.
+    scaled : bool
+        Whether the blocks below the top of the hierarchy stand for many.
 
     """
     (columns, rows), packet = packet_of_pixel(trace.size)
@@ -92,17 +124,34 @@ def tile_frame(
     place = np.arange(columns * rows)
     tile = place // columns // down * -(-columns // across) + place % columns // across
     order = np.argsort(tile, kind="stable")
-    first = np.concatenate([[0], np.cumsum(np.bincount(tile))])
+    total = published[0] * published[1]
+    copies = max(1, round(total / trace.pixels))
+    first = np.concatenate([[0], np.cumsum(np.bincount(tile)) * copies])
 
     begins, rays, camera = packet_rays(trace)
-    weight = published[0] * published[1] / trace.pixels
     incoherent = np.diff(begins) - camera
-    seconds = (camera * ray_seconds[0] + incoherent * ray_seconds[1]) * (weight * repeats)
-    traced = np.cumsum(np.bincount(packet, minlength=columns * rows)[order])
-    pixels = np.diff(traced * (published[0] * published[1]) // trace.pixels, prepend=0)
+    seconds = (camera * ray_seconds[0] + incoherent * ray_seconds[1]) * (total / trace.pixels * repeats / copies)
+    traced = np.repeat(np.bincount(packet, minlength=columns * rows)[order], copies)
+    pixels = np.diff(np.cumsum(traced) * total // (trace.pixels * copies), prepend=0)
+
+    apart = copies if scaled else 1
+    lower = (~references.upper, np.ones(references.triangle_blocks, np.bool_))
+    numbers = [np.concatenate([[0], np.cumsum(np.where(each, apart, 1))]) for each in lower]
     streams = (
-        Stream(references.node_first, references.node).taken(order),
-        Stream(references.triangle_first, references.triangle).taken(order),
+        Stream(references.node_first, references.node).taken(np.repeat(order, copies)),
+        Stream(references.triangle_first, references.triangle).taken(np.repeat(order, copies)),
     )
+    if apart > 1:
+        for stream, each, number in zip(streams, lower, numbers, strict=True):
+            copy = np.repeat(np.tile(np.arange(copies), len(order)), np.diff(stream.first))
+            stream.block[:] = number[stream.block] + np.where(each[stream.block], copy, 0)
+    none = np.zeros(0, np.int64)
     by_packet = np.split(rays, begins[1:-1])
-    return TiledFrame(first, pixels, seconds[order], streams, [by_packet[i] for i in order.tolist()], weight)
+    return TiledFrame(
+        first,
+        pixels,
+        np.repeat(seconds[order], copies),
+        streams,
+        (int(numbers[0][-1]), int(numbers[1][-1])),
+        [by_packet[i] if k == 0 else none for i in order.tolist() for k in range(copies)],
+    )

@@ -67,6 +67,8 @@ class Blocks:
         Three corners each.
     ids : int32 array (triangles,)
         The row of each in the faces they were built from.
+    upper : bool array (node blocks,)
+        Whether a block belongs to the top of the hierarchy, where blocks are never smaller than `NODE_BLOCK`.
     triangle_block : int
         Triangles of a block.
 
@@ -78,6 +80,7 @@ class Blocks:
     block: I32
     triangles: F32
     ids: I32
+    upper: NDArray[np.bool_]
     triangle_block: int = TRIANGLE_BLOCK
 
     @property
@@ -132,6 +135,8 @@ class References:
         Where each packet's references begin.
     node, triangle : int32 array (references,)
         Blocks, numbered from 0 on for either sort.
+    upper : bool array (node_blocks,)
+        Blocks of the top of the hierarchy; see `Blocks`.
     nodes, triangles : int
         How many the hierarchy has.
 
@@ -144,6 +149,7 @@ class References:
     node: I32
     triangle_first: I64
     triangle: I32
+    upper: NDArray[np.bool_]
     nodes: int
     triangles: int
 
@@ -182,14 +188,14 @@ def block_hierarchy(
     corners = vertices[faces]
     order = np.arange(len(faces), dtype=np.int32)
     bounds, link, count = _build(corners.min(axis=1), corners.max(axis=1), order)
-    place, block = _lay_out(link, count, node_block, max(node_block, NODE_BLOCK), _FULL_LEVELS)
+    place, block, upper = _lay_out(link, count, node_block, max(node_block, NODE_BLOCK), _FULL_LEVELS)
     bounds = np.stack([np.nextafter(bounds[:, :3], -np.inf), np.nextafter(bounds[:, 3:], np.inf)], 1).reshape(-1, 6)
     size = len(block)
     laid = np.zeros((size, 6), np.float32), np.zeros(size, np.int32), np.zeros(size, np.int32)
     laid[0][place] = bounds
     laid[1][place] = np.where(count < 0, place[np.where(count < 0, link, 0)], link)
     laid[2][place] = count
-    return Blocks(*laid, block, np.ascontiguousarray(corners[order].reshape(-1, 9)), order, triangle_block)
+    return Blocks(*laid, block, np.ascontiguousarray(corners[order].reshape(-1, 9)), order, upper, triangle_block)
 
 
 def walk(blocks: Blocks, first: I64, origin: F32, direction: F32, reach: F32, shadow: NDArray[np.bool_]) -> Walk:
@@ -255,7 +261,7 @@ def references(
     trace.complete()
     packets, packet = packet_of_pixel(trace.size)
     name = f"blocks-{node_block}-{triangle_block}-{_version()}"
-    columns = ("sizes", "node_first", "node", "triangle_first", "triangle")
+    columns = ("sizes", "node_first", "node", "triangle_first", "triangle", "upper")
     found = trace.store.load(name, columns)
     if found is None or not _consistent(found, packets[0] * packets[1]):
         found = _refer(trace, hierarchy(), packet)
@@ -263,7 +269,7 @@ def references(
     node_blocks, triangle_blocks, nodes, triangles = found["sizes"].tolist()
     return References(
         packets, node_blocks, triangle_blocks, found["node_first"], found["node"], found["triangle_first"],
-        found["triangle"], nodes, triangles,
+        found["triangle"], found["upper"], nodes, triangles,
     )  # fmt: skip
 
 
@@ -291,9 +297,13 @@ def _version() -> str:
 
 
 def _consistent(found: dict[str, Any], packets: int) -> bool:
-    return len(found["sizes"]) == 4 and all(
-        len(found[f"{sort}_first"]) == packets + 1 and found[f"{sort}_first"][-1] == len(found[sort])
-        for sort in ("node", "triangle")
+    return (
+        len(found["sizes"]) == 4
+        and len(found["upper"]) == found["sizes"][0]
+        and all(
+            len(found[f"{sort}_first"]) == packets + 1 and found[f"{sort}_first"][-1] == len(found[sort])
+            for sort in ("node", "triangle")
+        )
     )
 
 
@@ -321,7 +331,8 @@ def _refer(trace: Trace, blocks: Blocks, packet: I64) -> dict[str, Any]:
     is_node = found.block < blocks.node_blocks
     packets = int(packet[-1]) + 1
     made: dict[str, Any] = {
-        "sizes": np.array([blocks.node_blocks, blocks.triangle_blocks, len(blocks.link), len(blocks.triangles)])
+        "sizes": np.array([blocks.node_blocks, blocks.triangle_blocks, len(blocks.link), len(blocks.triangles)]),
+        "upper": blocks.upper,
     }
     for sort, of_sort, base in (("node", is_node, 0), ("triangle", ~is_node, blocks.node_blocks)):
         made[sort] = found.block[of_sort] - np.int32(base)
@@ -446,13 +457,17 @@ def _area(box):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _lay_out(link, count, small, full, full_levels):  # type: ignore[no-untyped-def]
-    """Return the place of each node in memory, and the block of each place: the one after the root stays empty."""
+    """Return the place of each node in memory, the block of each place, and which blocks are of the top.
+
+    The place after the root stays empty.
+    """
     n = len(link)
-    place, block = np.empty(n, np.int64), np.empty(n + 1, np.int32)
+    place, block, upper = np.empty(n, np.int64), np.empty(n + 1, np.int32), np.zeros(n + 1, np.bool_)
     waiting = np.empty((n // 2 + 2, 2), np.int64)
     queue = np.empty(full + 4, np.int64)
     place[0] = 0
     block[:2] = 0
+    upper[0] = True
     used, size, room, here, top = 2, full, full - 2, 0, 0
     if count[0] < 0:
         waiting[0, 0], waiting[0, 1] = link[0], 0
@@ -465,6 +480,7 @@ def _lay_out(link, count, small, full, full_levels):  # type: ignore[no-untyped-
         if room == 0 or wanted > size:
             here += 1
             size = room = wanted
+            upper[here] = level < full_levels
         while head < tail and room:
             pair = queue[head]
             head += 1
@@ -479,7 +495,7 @@ def _lay_out(link, count, small, full, full_levels):  # type: ignore[no-untyped-
         for i in range(tail - 1, head - 1, -1):
             waiting[top, 0], waiting[top, 1] = queue[i], level + 1
             top += 1
-    return place, block[:used].copy()
+    return place, block[:used].copy(), upper[: here + 1].copy()
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -94,7 +94,8 @@ class CameraCard(Card):
     """A pinhole camera, and its way through the frames of an animation.
 
     ``sampling`` says where rays go through their pixels: ``jittered``, through random points, or ``corner``, all
-    through the lower left corner, as SpRay does with one sample a pixel.
+    through the lower left corner, as SpRay does with one sample a pixel. ``path_frames`` says how many frames there are
+    from the beginning of ``path`` to its end where a viewer shows one after the other.
     """
 
     position: Vector
@@ -103,6 +104,7 @@ class CameraCard(Card):
     vertical_fov_degrees: Annotated[float, Field(gt=0, lt=180)] = 40.0
     sampling: Literal["jittered", "corner"] = "jittered"
     path: tuple[KeyCard, ...] = ()
+    path_frames: Annotated[int, Field(ge=2)] | None = None
 
     @model_validator(mode="after")
     def _has_a_direction(self) -> CameraCard:

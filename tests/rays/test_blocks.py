@@ -96,6 +96,18 @@ def test_triangles_lie_in_the_order_of_a_traversal(made):
 # Blocks
 
 
+def test_the_upper_blocks_are_never_small(mesh):
+    made = block_hierarchy(*mesh, 16, 10)
+    sizes = np.bincount(made.block)
+    assert len(made.upper) == made.node_blocks == len(sizes)
+    assert made.upper[0]
+    assert (sizes[made.upper] == NODE_BLOCK).all()
+    assert sizes[~made.upper].max() == 16
+    parents = np.flatnonzero(made.count < 0)
+    below = made.upper[made.block[made.link[parents]]]
+    assert made.upper[made.block[parents]][below].all()  # what is above an upper one is one
+
+
 def test_blocks_are_full_and_pairs_whole(made):
     assert made.block[0] == 0
     assert set(np.diff(made.block).tolist()) <= {0, 1}
@@ -279,7 +291,7 @@ def test_damaged_references_are_made_again(tmp_path):
     trace = workload.trace(1)
     found = references(trace, lambda: made)
     name = next(path.stem for path in trace.store.folder.glob("blocks-*.npz"))
-    columns = ("sizes", "node_first", "node", "triangle_first", "triangle")
+    columns = ("sizes", "node_first", "node", "triangle_first", "triangle", "upper")
     stored = trace.store.load(name, columns)
     trace.store.save(name, stored | {"node": stored["node"][:-3]})
     assert np.array_equal(references(trace, lambda: made).node, found.node)
