@@ -88,10 +88,10 @@ def render(
     names = [devices.processor(index).name for index in range(layout.ranks)]
     timeline = Timeline(layout.ranks, names)
     together = layout.size if policy.in_situ else layout.ranks
-    frames = [
-        _frame(env, devices, crossings, policy, timeline, workload, island, together)
-        for island in range(layout.ranks // together)
-    ]
+    frames: list[DomainFrame] = []
+    for island in range(layout.ranks // together):
+        other = frames[0] if frames else None
+        frames.append(_frame(env, devices, crossings, policy, timeline, workload, island, together, other))
     ranks = [env.process(policy.rank(DomainRank(f, index))) for f in frames for index in range(f.ranks)]
     env.run(env.all_of(ranks))
     frame_time_s = to_seconds(int(env.now))
@@ -149,6 +149,7 @@ def _frame(
     workload: Workload,
     island: int,
     size: int,
+    other: DomainFrame | None,
 ) -> DomainFrame:
     """Return the state of one island's ranks."""
     trace, domains = crossings.trace, crossings.domains
@@ -165,7 +166,7 @@ def _frame(
         devices.communicator(list(range(first, first + size))) if size > 1 else None,
         owners(policy, domains, size) if policy.in_situ else None,
         rank_of_pixel, [DomainCache(sizes, capacity) for _ in range(size)],
-        workload.weight * workload.repeats, workload.card.published.resolution, first,
+        workload.weight * workload.repeats, workload.card.published.resolution, first, other,
     )  # fmt: skip
 
 

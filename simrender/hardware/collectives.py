@@ -12,6 +12,7 @@ A rank may begin a collective before it is done with another; they then run side
 
 from __future__ import annotations
 
+import bisect
 import functools
 import math
 import operator
@@ -46,6 +47,8 @@ class Message:
     nbytes : float
     tick : int
         When the receiver had it.
+    messages : int
+        More than one if it is a train.
 
     """
 
@@ -53,6 +56,7 @@ class Message:
     tag: int
     nbytes: float
     tick: int
+    messages: int = 1
 
 
 def run_until(event: simpy.Event, *communicators: Communicator) -> Any:
@@ -176,7 +180,8 @@ class Communicator:
         for target in range(self.size):
             if target in self._mailboxes:
                 box = self._mailboxes[target]
-                lines += [f"{m} was never received" for queue in box.messages.values() for m in queue]
+                left = [message for queue in box.messages.values() for message in queue]
+                lines += [f"{m} {'was' if m.messages == 1 else 'were'} never received" for m in left]
                 lines += [f"{receive} never got a message" for receive in box.receives]
         for number, collective in self._collectives.items():
             absent = [str(rank) for rank, calls in enumerate(self._calls) if calls <= number]
@@ -217,25 +222,29 @@ class Communicator:
 
     # -- messages ---------------------------------------------------------------------------------------------------
 
-    def _isend(self, source: Rank, target: int, nbytes: float, tag: int) -> simpy.Event:
+    def _isend(self, source: Rank, target: int, nbytes: float, tag: int, messages: int) -> simpy.Event:
         self._check_rank(target)
         if not 0.0 <= nbytes < math.inf:
             raise ScheduleError(f"a message's size must be finite and not negative, got {nbytes!r} B")
-        is_eager = nbytes <= self.transport.card.eager
+        if operator.index(messages) < 1:
+            raise ScheduleError(f"at least 1 message is sent, got {messages}")
+        is_eager = nbytes / messages <= self.transport.card.eager
         ready = max(self._now, source.free_at)
         if is_eager:
             place, busy_until = self.ranks[source.index], self.transport.busy_until
             ready = max(ready, int(busy_until[place]))
-        source.free_at = ready + self.transport.overhead_ticks
-        sent = _Sent(self._sent, source.index, target, tag, float(nbytes), ready, simpy.Event(self.env))
+        source.free_at = ready + messages * self.transport.overhead_ticks
+        sent = _Sent(self._sent, source.index, target, tag, float(nbytes), ready, simpy.Event(self.env), messages)
         self._sent += 1
         self._mailbox(target).messages.setdefault(sent.source, []).append(sent)
         if is_eager:
             tick = self._leave(sent, ready)
-            _, s_per_byte = self.transport.alpha_beta(place, self.ranks[target], sent.nbytes)
-            busy_until[place] = tick + to_ticks(sent.nbytes * s_per_byte)
-            source.free_at = tick
-            _succeed_at(sent.done, tick, tick)
+            _, s_per_byte = self.transport.alpha_beta(place, self.ranks[target], sent.each)
+            gap = to_ticks(sent.each * s_per_byte)
+            last = tick + (messages - 1) * (gap + self.transport.overhead_ticks)
+            busy_until[place] = last + gap
+            source.free_at = last
+            _succeed_at(sent.done, last, last)
         else:
             self._show(sent)
         return sent.done
@@ -256,16 +265,22 @@ class Communicator:
     def _leave(self, sent: _Sent, ready: int) -> int:
         """Send a message as soon as its sender has an overhead to spare for it; return when."""
         overhead, source = self.transport.overhead_ticks, self._members[sent.source]
-        tick = ready + overhead
-        now = self._now
-        source.leaving = sorted(other for other in source.leaving if other > now)
-        for other in source.leaving:
-            if abs(other - tick) < overhead:
-                tick = other + overhead
-        source.leaving.append(tick)
+        tick, leaving = ready + overhead, source.leaving
+        del leaving[: bisect.bisect_right(leaving, self._now)]
+        for other in leaving[bisect.bisect_right(leaving, tick - overhead) :]:
+            if other - tick >= overhead:
+                break
+            tick = other + overhead
+        bisect.insort(leaving, tick)
+        count = None
+        if sent.messages > 1:
+            bisect.insort(leaving, tick + (sent.messages - 1) * overhead)
+            count = np.array([sent.messages])
         self._sends[sent.number] = sent
-        ends = np.array([sent.source]), np.array([sent.target])
-        self._post(*ends, np.array([sent.nbytes]), np.array([tick]), self._arrive, np.array([sent.number]))
+        self.transport.post(
+            self._numbers[[sent.source]], self._numbers[[sent.target]], np.array([sent.nbytes]), np.array([tick]),
+            self._arrive, np.array([sent.number]), count,
+        )  # fmt: skip
         return tick
 
     def _arrive(self, keys: NDArray[np.int64], tick: int) -> None:
@@ -294,7 +309,7 @@ class Communicator:
             box.messages[sent.source].remove(sent)
             if not box.messages[sent.source]:
                 del box.messages[sent.source]
-            if sent.nbytes <= self.transport.card.eager:
+            if sent.each <= self.transport.card.eager:
                 _succeed_at(receive.done, self._now, sent.as_message(self._now))
             else:
                 sent.receive = receive
@@ -393,14 +408,20 @@ class _Sent:
     nbytes: float
     ready: int
     done: simpy.Event
+    messages: int = 1
     shown: int = 0  # after how many others receives could have it: once arrived, or at once if it waits for one
     receive: _Receive | None = None
 
+    @property
+    def each(self) -> float:
+        return self.nbytes / self.messages
+
     def as_message(self, tick: int) -> Message:
-        return Message(self.source, self.tag, self.nbytes, tick)
+        return Message(self.source, self.tag, self.nbytes, tick, self.messages)
 
     def __str__(self) -> str:
-        return f"a message of {self.nbytes:.17g} B, tag {self.tag}, from rank {self.source} to rank {self.target}"
+        what = "a message of" if self.messages == 1 else f"{self.messages} messages of together"
+        return f"{what} {self.nbytes:.17g} B, tag {self.tag}, from rank {self.source} to rank {self.target}"
 
 
 @dataclass(slots=True, eq=False)
@@ -433,6 +454,9 @@ class _Mailbox:
         Messages of one sender do not overtake each other: the first that fits is taken, or waited for. Of several
         senders' messages the one that was there first is taken.
         """
+        if receive.source is None and receive.tag is None:
+            there = [queue[0] for queue in self.messages.values() if queue[0].shown]
+            return min(there, key=lambda sent: sent.shown, default=None)
         sources = self.messages if receive.source is None else [receive.source]
         firsts = [next(filter(receive.fits, self.messages.get(source, ())), None) for source in sources]
         there = [sent for sent in firsts if sent is not None and sent.shown]
@@ -524,11 +548,20 @@ class Rank:
         values = () if name == "barrier" else tuple(np.atleast_1d(sizes).tolist())
         return self.comm._call(self.index, _Call(name, values, is_vector, root, algorithm), None)
 
-    def isend(self, target: int, nbytes: float, tag: int = 0) -> simpy.Event:
+    def isend(self, target: int, nbytes: float, tag: int = 0, messages: int = 1) -> simpy.Event:
         """Send a message; done when it has left, or when it has arrived if it is too large to be eager.
 
         Sends of one rank leave at least an overhead apart, and an eager one not before the rank's adapter can be
         through with the eager ones before it, those of collectives among them.
+
+        Parameters
+        ----------
+        target : int
+        nbytes : float
+        tag : int
+        messages : int
+            As how many messages of one size, which are received together, the bytes count: a train. Eager ones follow
+            each other; larger ones share the links as so many would.
 
         Raises
         ------
@@ -536,7 +569,38 @@ class Rank:
             If there is no such rank or size.
 
         """
-        return self.comm._isend(self, target, nbytes, tag)
+        return self.comm._isend(self, target, nbytes, tag, messages)
+
+    def isend_trains(self, targets: NDArray[np.int64], nbytes: NDArray[np.float64]) -> list[simpy.Event]:
+        """Send many messages, those to one rank that the library treats alike as one train.
+
+        A hundred ranks with a dozen messages for each other have a hundred thousand of them on their way. That those of
+        a train are equally long and leave together is an approximation; `simrender.policies.speculation` says how good.
+
+        Parameters
+        ----------
+        targets : int64 array, (n,)
+        nbytes : float64 array, (n,)
+
+        Returns
+        -------
+        list of simpy.Event
+            One a train, in the order of their first messages.
+
+        Raises
+        ------
+        ScheduleError
+            If there is no such rank or size.
+
+        """
+        classes = self.comm.transport.size_class(nbytes)
+        alike = targets * (classes.max(initial=0) + 1) + classes
+        _, first, train = np.unique(alike, return_index=True, return_inverse=True)
+        total, count = np.bincount(train, nbytes), np.bincount(train)
+        return [
+            self.isend(int(targets[first[k]]), float(total[k]), messages=int(count[k]))
+            for k in np.argsort(first).tolist()
+        ]
 
     def irecv(self, source: int | None = None, tag: int | None = None) -> simpy.Event:
         """Receive a message from a rank, or any, with a tag, or any; the value of the event is the `Message`.

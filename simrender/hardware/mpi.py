@@ -197,6 +197,7 @@ class Transport:
         starts: NDArray[np.int64],
         listener: Listener,
         keys: NDArray[np.int64],
+        messages: NDArray[np.int64] | None = None,
     ) -> None:
         """Send messages from rank to rank.
 
@@ -210,6 +211,9 @@ class Transport:
         listener : callable
             Called with ``(keys, tick)`` when some have arrived (`Network.post`).
         keys : int64 array, (n,)
+        messages : int64 array, (n,), optional
+            As how many messages of one size each counts. Eager ones leave one after the other, an overhead apart;
+            larger ones share the links as so many would.
 
         Raises
         ------
@@ -219,12 +223,26 @@ class Transport:
         """
         nodes, senders, receivers = self._endpoints, sources.tolist(), targets.tolist()
         ends = [nodes[rank] for rank in senders], [nodes[rank] for rank in receivers]
-        if not self._above and self.staging is None:
+        if not self._above and self.staging is None and messages is None:
             self.network.post(*ends, nbytes, starts, listener, keys)
             return
-        limits = [self.limit(*message) for message in zip(senders, receivers, nbytes.tolist(), strict=True)]
+        each = nbytes if messages is None else nbytes / messages
+        limits = [self.limit(*message) for message in zip(senders, receivers, each.tolist(), strict=True)]
         caps, delays = zip(*limits, strict=True) if limits else ((), ())
-        self.network.post(*ends, nbytes, starts, listener, keys, caps=caps, delays=delays)
+        if messages is None:
+            self.network.post(*ends, nbytes, starts, listener, keys, caps=caps, delays=delays)
+            return
+        at_once = np.where(each <= float(self.card.eager), 1, messages)
+        most = np.array(caps) * at_once
+        for i in np.flatnonzero((at_once < messages) & (nbytes > 0.0)).tolist():
+            _, s_per_byte = self.alpha_beta(senders[i], receivers[i], float(each[i]))
+            waits_s = to_seconds(self.overhead_ticks) * (int(messages[i]) - 1)
+            most[i] = nbytes[i] / (nbytes[i] * s_per_byte + waits_s)
+        self.network.post(*ends, nbytes, starts, listener, keys, caps=most, delays=delays, weights=at_once)
+
+    def size_class(self, nbytes: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Return a number for each message: equal for those that the card's protocols and ranges treat alike."""
+        return 2 * np.searchsorted(self._above, nbytes, "right") + (nbytes > float(self.card.eager))
 
     def gap_ticks(
         self, sources: NDArray[np.integer[Any]], targets: NDArray[np.integer[Any]], nbytes: NDArray[np.float64]

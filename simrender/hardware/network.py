@@ -305,6 +305,7 @@ class Network:
         *,
         caps: ArrayLike | None = None,
         delays: ArrayLike | None = None,
+        weights: ArrayLike | None = None,
     ) -> None:
         """Send many messages, without an event each.
 
@@ -323,6 +324,8 @@ class Network:
             The most that each gets, in B/s.
         delays : int64 array, (n,), optional
             Ticks of latency beside the routes' own.
+        weights : float64 array, (n,), optional
+            As for `transfer`; 1 by default.
 
         Raises
         ------
@@ -339,13 +342,16 @@ class Network:
         begins, names = column(whole(starts), count), column(whole(keys), count)
         limits = np.full(count, math.inf) if caps is None else column(np.asarray(caps, np.float64), count)
         waits = np.zeros(count, np.int64) if delays is None else column(whole(delays), count)
+        shares = column(np.asarray(1.0 if weights is None else weights, np.float64), count)
+        if ((shares < _WEIGHTS[0]) | (shares > _WEIGHTS[1])).any():
+            raise ScheduleError(f"a transfer's weight must lie between 1/1024 and 1024, got {shares.tolist()}")
         if count <= _FEW:
             numbers = list(zip(sizes.tolist(), begins.tolist(), limits.tolist(), waits.tolist(), strict=True))
             for each in numbers:
                 check_transfer(*each, now)
-            messages = zip(names.tolist(), pairs, routes, numbers, strict=True)
-            for key, pair, route, (size, begin, limit, wait) in messages:
-                self._send(listener, key, pair, route, size, begin, 1.0, limit, wait)
+            messages = zip(names.tolist(), pairs, routes, shares.tolist(), numbers, strict=True)
+            for key, pair, route, share, (size, begin, limit, wait) in messages:
+                self._send(listener, key, pair, route, size, begin, share, limit, wait)
             return
         good = (sizes >= 0.0) & (sizes < math.inf) & (begins >= now) & (limits > 0.0) & (waits >= 0)
         if not good.all():
@@ -365,7 +371,7 @@ class Network:
         stories["number"] = np.arange(self._started, self._started + count)
         stories["nbytes"] = flows["remaining"] = sizes
         flows["finish"] = ends - self._epoch
-        flows["weight"] = round(1.0 / WEIGHT_UNIT)
+        flows["weight"] = np.rint(shares / WEIGHT_UNIT)
         stories["cap"] = limits
         flows["hops"] = np.where(sizes > 0.0, lengths, 0)
         flows["next"] = flows["leader"] = flows["place"] = NONE

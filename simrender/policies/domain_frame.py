@@ -168,6 +168,8 @@ class DomainFrame:
     weight : float
         Published rays for which a traced ray stands.
     published : (width, height)
+    other : DomainFrame or None
+        Another island, with which this one shares what there is for each ray, since each ray has one island.
 
     """
 
@@ -184,6 +186,7 @@ class DomainFrame:
     weight: float
     published: tuple[int, int]
     first_rank: int = 0
+    other: DomainFrame | None = None
     counters: Counters = field(default_factory=Counters)
     events: list[Event] = field(default_factory=list)
     moments: list[Moment] = field(default_factory=list)
@@ -200,10 +203,13 @@ class DomainFrame:
         trace = self.crossings.trace
         self.trace, self.domains = trace, self.crossings.domains
         self.ranks = len(self.caches)
-        kind = trace.column("kind")
-        self.coherent, self.shadow = kind == CAMERA, kind == SHADOW
-        self.position = self.visits.first[:-1].copy()
-        """The next visit of each ray."""
+        if self.other is None:
+            kind = trace.column("kind")
+            self.coherent, self.shadow = kind == CAMERA, kind == SHADOW
+            self.position = self.visits.first[:-1].copy()
+            """The next visit of each ray."""
+        else:
+            self.coherent, self.shadow, self.position = self.other.coherent, self.other.shadow, self.other.position
         self.peak_rays = [0] * self.ranks
         self.peak_bytes = [0.0] * self.ranks
         """What a rank's rays, queues and buffers took at most, as published, where the policy counts it."""

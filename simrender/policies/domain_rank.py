@@ -245,21 +245,30 @@ class DomainRank:
         frame.counters.sent_bytes += nbytes * frame.weight
         return self.comm.isend(target, nbytes * frame.weight, tag)
 
-    def post(self, target: int, rays: int, tag: int, nbytes: float, header: float = 0.0) -> simpy.Event:
-        """Send so many rays, which take ``nbytes`` and a header; done when they have left."""
-        counters, nbytes = self._frame.counters, nbytes * self._frame.weight + header
+    def post(self, targets: Ids, rays: Ids, ray_bytes: float, header_bytes: float, grouped: bool) -> list[simpy.Event]:
+        """Send so many rays to each of the targets, with a header; each event is done when some of them have left.
+
+        Grouped, messages to one rank that the library treats alike travel together (`Rank.isend_trains`).
+        """
+        counters = self._frame.counters
+        nbytes: NDArray[np.float64] = np.float64(ray_bytes * self._frame.weight) * rays + header_bytes
+        if not len(rays):
+            return []
         assert self.comm is not None  # noqa: S101 - there is another rank
-        counters.messages += 1
-        counters.sent_rays += rays
-        counters.sent_bytes += nbytes
-        return self.comm.isend(target, nbytes, tag)
+        counters.messages += len(rays)
+        counters.sent_rays += int(rays.sum())
+        counters.sent_bytes += float(nbytes.sum())
+        if grouped:
+            return self.comm.isend_trains(targets, nbytes)
+        return [self.comm.isend(*message) for message in zip(targets.tolist(), nbytes.tolist(), strict=True)]
 
     def collect(self, messages: int, rays: int) -> Steps:
         """Wait for so many messages with so many rays."""
         frame, begin = self._frame, int(self._frame.env.now)
-        for _ in range(messages):
+        left = messages
+        while left:
             assert self.comm is not None  # noqa: S101 - there is another rank
-            yield self.comm.irecv()
+            left -= (yield self.comm.irecv()).messages
         if messages:
             frame.timeline.add(self.device, COPY, begin, int(frame.env.now), 0.0, rays * frame.weight)
 

@@ -60,9 +60,8 @@ def fullest(counts: NDArray[np.int64], among: Iterable[int] | None = None) -> in
     if among is None:
         best = int(counts.argmax())
         return best if counts[best] > 0 else None
-    chosen = np.fromiter(among, np.int64)
+    chosen = np.sort(among if isinstance(among, np.ndarray) else np.fromiter(among, np.int64))
     if len(chosen) == 0:
         return None
-    chosen.sort()
     best = int(chosen[counts[chosen].argmax()])
     return best if counts[best] > 0 else None

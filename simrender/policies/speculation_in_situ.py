@@ -113,6 +113,8 @@ class InSitu:
     header_bytes : float
     cached_first : bool
         Whether a rank takes all cached hits before any other ray, and not domain by domain.
+    grouped : bool
+        Whether a rank's messages to another one travel together; see `DomainRank.post`.
 
     Attributes
     ----------
@@ -129,12 +131,14 @@ class InSitu:
         ray_bytes: float | None,
         header_bytes: float,
         cached_first: bool,
+        grouped: bool,
     ) -> None:
         assert frame.owner is not None  # noqa: S101 - domains stay with ranks
         self.frame, self.tree, self.owner, self.cached_first = frame, tree, frame.owner, cached_first
         self.blocking = blocking
         self.max_depth = bounces(frame.trace.integrator)
         self.ray_bytes, self.header_bytes = ray_bytes or DEFAULT_RAY_BYTES, header_bytes
+        self.grouped = grouped
         self.tbuf_bytes = self.obuf_bytes = 0.0
 
     def spray(self, me: DomainRank, tile: int) -> Steps:
@@ -145,8 +149,9 @@ class InSitu:
             work = yield from me.allreduce(self.work_counter(me.index, batch))
             if not work.any():
                 break
-            me.explain(np.bincount(batch.domain, batch.rays, self.frame.domains.count).astype(np.int64),
-                       tuple(np.unique(batch.domain).tolist()), together=True)  # fmt: skip
+            if me.index == 0:
+                waiting = np.bincount(batch.domain, batch.rays, self.frame.domains.count).astype(np.int64)
+                me.explain(waiting, tuple(np.flatnonzero(waiting).tolist()), together=True)
             me.count_step()
             yield from self.send_and_receive(me, batch)
             done = me.alike(lambda: self.process(batch))  # noqa: B023 - called at once
@@ -228,11 +233,8 @@ class InSitu:
     def send_and_receive(self, me: DomainRank, batch: Batch) -> Steps:
         """Send each block to the owner of its domain, and receive those for this rank (listing 5, line 8)."""
         target = self.owner[batch.domain]
-        leaving = [
-            me.post(int(target[i]), int(batch.rays[i]), int(batch.kind[i]), float(batch.rays[i]) * self.ray_bytes,
-                    self.header_bytes)
-            for i in np.flatnonzero((batch.source == me.index) & (target != me.index)).tolist()
-        ]  # fmt: skip
+        mine = (batch.source == me.index) & (target != me.index)
+        leaving = me.post(target[mine], batch.rays[mine], self.ray_bytes, self.header_bytes, self.grouped)
         arriving = (batch.source != me.index) & (target == me.index)
         yield from me.collect(int(arriving.sum()), int(batch.rays[arriving].sum()))
         for event in leaving:  # noqa: UP028 - SimPy's events are no generators

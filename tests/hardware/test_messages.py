@@ -2,9 +2,12 @@
 
 import itertools
 
+import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from simrender.errors import ScheduleError
 from simrender.hardware.collectives import Communicator, Message
 from tests.crossbar import ALL_EAGER, LATENCY, NONE_EAGER, US, check, crossbar
 
@@ -34,6 +37,55 @@ def test_eager_messages_of_one_rank_leave_an_overhead_and_their_bytes_apart():
     env.run()
     assert [send.value for send in sends] == [US, 6 * US, 11 * US]
     assert [receive.value.tick for receive in receives] == [7 * US, 12 * US, 17 * US]
+
+
+def test_an_eager_train_takes_what_its_messages_take_one_after_the_other():
+    env, comm = crossbar(4)
+    sends = [comm.rank(0).isend(1, 3 * 4000.0, messages=3), comm.rank(0).isend(2, 4000.0)]
+    receives = [comm.rank(1).irecv(), comm.rank(2).irecv()]
+    env.run()
+    assert [send.value for send in sends] == [11 * US, 16 * US]
+    assert receives[0].value == Message(0, 0, 12000.0, 17 * US, 3)
+    assert receives[1].value.tick == 22 * US
+
+
+def test_a_rendezvous_train_shares_links_as_its_messages_would():
+    def arrivals(train):
+        env, comm = crossbar(3, eager=NONE_EAGER, overhead="0 us", ranges=HALF)
+        parts = [3] if train else [1, 1, 1]
+        sends = [comm.rank(0).isend(2, part * 4000.0, messages=part) for part in parts]
+        sends.append(comm.rank(0).isend(2, 4000.0))
+        receives = [comm.rank(2).irecv() for _ in sends]
+        env.run()
+        return sorted({send.value for send in sends}), sum(receive.value.messages for receive in receives)
+
+    # Each gets a quarter of the link, and none the half that is the most for any.
+    assert arrivals(train=True) == arrivals(train=False) == ([LATENCY + 16 * US], 4)
+
+
+HALF = [{"above": "1 B", "bandwidth": 0.5, "latency": 1}]
+
+
+def test_messages_to_a_rank_that_are_treated_alike_are_one_train():
+    env, comm = crossbar(3, eager="4000 B", ranges=LARGE_LATER)
+    targets = np.array([1, 2, 1, 1, 1, 2])
+    sends = comm.rank(0).isend_trains(targets, np.array([500.0, 900.0, 3000.0, 700.0, 9000.0, 300.0]))
+    receives = [comm.rank(target).irecv() for target in (1, 1, 1, 2)]
+    env.run()
+    got = {(receive.value.nbytes, receive.value.messages) for receive in receives}
+    assert got == {(1200.0, 2), (3000.0, 1), (9000.0, 1), (1200.0, 2)}
+    assert len(sends) == 4
+    assert sends == sorted(sends, key=lambda event: event.value)
+    assert comm.rank(0).isend_trains(np.zeros(0, np.int64), np.zeros(0)) == []
+
+
+def test_a_train_that_nobody_receives_is_named():
+    env, comm = crossbar(2)
+    comm.rank(0).isend(1, 300.0, 7, messages=3)
+    env.run()
+    assert comm.unmatched() == "3 messages of together 300 B, tag 7, from rank 0 to rank 1 were never received"
+    with pytest.raises(ScheduleError, match="at least 1 message is sent, got 0"):
+        comm.rank(0).isend(1, 1.0, messages=0)
 
 
 def test_a_message_waits_for_the_adapter_until_a_collective_is_through():

@@ -297,6 +297,21 @@ def test_tiles_take_less_memory_and_more_work(data):
     assert parts.counters.sent_rays == whole.counters.sent_rays
 
 
+@pytest.mark.parametrize("ranks", [3, 16])
+def test_messages_that_travel_together_take_about_as_long_and_are_as_many(ranks):
+    grouped, single = (play(Speculation("in_situ", messages=each), wavelets(*SMALL), ranks) for each in MESSAGES)
+    assert grouped.counters == single.counters
+    assert all(schedule(grouped, rank) == schedule(single, rank) for rank in range(ranks))
+    assert grouped.env.now == pytest.approx(single.env.now, rel=0.02)
+    check_image(grouped)
+    # Where no rank has two messages for another, there is nothing to approximate.
+    grouped, single = (play(Speculation("in_situ", messages=each), figure2(), 4, owner=FOUR) for each in MESSAGES)
+    assert grouped.timeline.sha256() == single.timeline.sha256()
+
+
+MESSAGES, FOUR = ("grouped", "single"), np.arange(4)
+
+
 def test_each_rank_has_an_equal_share_of_each_tile():
     rank = np.array([1, 1, 0, 0, 0, 0, -1, 1, 1, 2])
     assert equal_tiles(rank, 2).tile.tolist() == [0, 0, 0, 0, 1, 1, 0, 1, 1, 0]
