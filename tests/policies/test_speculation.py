@@ -17,6 +17,7 @@ from simrender.policies.speculation import Speculation
 from simrender.rays.domains import rectilinear, uniform_grid
 from simrender.rays.integrators import AmbientOcclusion, PathTracing, RayCasting, SprayPathTracing
 from simrender.rays.speculative import ray_tree
+from simrender.simulation import simulate
 from tests.policies.driver import check_image, gardens, play, schedule, wavelets
 from tests.policies.figure2 import A, B, C, D, figure2
 from tests.policies.layers import by_object, layers
@@ -307,6 +308,12 @@ def test_messages_that_travel_together_take_about_as_long_and_are_as_many(ranks)
     # Where no rank has two messages for another, there is nothing to approximate.
     grouped, single = (play(Speculation("in_situ", messages=each), figure2(), 4, owner=FOUR) for each in MESSAGES)
     assert grouped.timeline.sha256() == single.timeline.sha256()
+
+
+def test_a_result_says_that_messages_travelled_together():
+    for each, said in zip(MESSAGES, (True, False), strict=True):
+        result = simulate("stampede2-skx", "wavelets", Speculation("in_situ", messages=each), nodes=4, islands=1)
+        assert ("each message to a rank by itself" in {item["what"] for item in result.scope["left_out"]}) == said
 
 
 MESSAGES, FOUR = ("grouped", "single"), np.arange(4)
