@@ -22,7 +22,7 @@ from pydantic import Field, field_validator
 from simrender.cards import Card, Count, Duration, Quantity, Size
 from simrender.clock import TICK_NOISE, TICKS_PER_SECOND, to_seconds, to_ticks
 from simrender.errors import ScheduleError, did_you_mean
-from simrender.hardware.network import Listener, Network
+from simrender.hardware.network import WEIGHTS, Listener, Network
 from simrender.hardware.schedules import INSTEAD, usable
 
 Flavour = Literal["mpich", "openmpi", "mvapich2"]
@@ -232,12 +232,13 @@ class Transport:
         if messages is None:
             self.network.post(*ends, nbytes, starts, listener, keys, caps=caps, delays=delays)
             return
-        at_once = np.where(each <= float(self.card.eager), 1, messages)
+        at_once = np.where(each <= float(self.card.eager), 1, np.minimum(messages, int(WEIGHTS[1])))
         most = np.array(caps) * at_once
-        for i in np.flatnonzero((at_once < messages) & (nbytes > 0.0)).tolist():
+        for i in np.flatnonzero((each <= float(self.card.eager)) & (messages > 1)).tolist():
             _, s_per_byte = self.alpha_beta(senders[i], receivers[i], float(each[i]))
-            waits_s = to_seconds(self.overhead_ticks) * (int(messages[i]) - 1)
-            most[i] = nbytes[i] / (nbytes[i] * s_per_byte + waits_s)
+            seconds = float(nbytes[i]) * s_per_byte + (int(messages[i]) - 1) * to_seconds(self.overhead_ticks)
+            if nbytes[i] and seconds:
+                most[i] = float(nbytes[i]) / seconds
         self.network.post(*ends, nbytes, starts, listener, keys, caps=most, delays=delays, weights=at_once)
 
     def size_class(self, nbytes: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -38,7 +38,8 @@ Listener = Callable[[NDArray[np.int64], int], None]
 _FIRST = EventPriority(NORMAL - 1)
 _LAST = EventPriority(NORMAL + 1)  # after everything that SimPy itself schedules at the same tick
 _FEW = 8  # messages sent together, at which it is as fast to send them one by one
-_WEIGHTS = (1.0 / 1024.0, 1024.0)
+WEIGHTS = (1.0 / 1024.0, 1024.0)
+"""The least and the greatest weight of a transfer."""
 
 
 class _Alarm(simpy.Event):
@@ -257,7 +258,7 @@ class Network:
         route = self._table.made.get(pair) or self._route(source, target)
         now = cast("int", self._env.now)
         start, delay = now if start is None else operator.index(start), operator.index(delay)
-        if not _WEIGHTS[0] <= weight <= _WEIGHTS[1]:
+        if not WEIGHTS[0] <= weight <= WEIGHTS[1]:
             raise ScheduleError(f"a transfer's weight must lie between 1/1024 and 1024, got {weight!r}")
         check_transfer(nbytes, start, cap, delay, now)
         done = simpy.Event(self._env)
@@ -343,7 +344,7 @@ class Network:
         limits = np.full(count, math.inf) if caps is None else column(np.asarray(caps, np.float64), count)
         waits = np.zeros(count, np.int64) if delays is None else column(whole(delays), count)
         shares = column(np.asarray(1.0 if weights is None else weights, np.float64), count)
-        if ((shares < _WEIGHTS[0]) | (shares > _WEIGHTS[1])).any():
+        if ((shares < WEIGHTS[0]) | (shares > WEIGHTS[1])).any():
             raise ScheduleError(f"a transfer's weight must lie between 1/1024 and 1024, got {shares.tolist()}")
         if count <= _FEW:
             numbers = list(zip(sizes.tolist(), begins.tolist(), limits.tolist(), waits.tolist(), strict=True))

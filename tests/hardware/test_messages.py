@@ -63,6 +63,15 @@ def test_a_rendezvous_train_shares_links_as_its_messages_would():
     assert arrivals(train=True) == arrivals(train=False) == ([LATENCY + 16 * US], 4)
 
 
+def test_a_train_may_be_longer_than_a_weight_is_great():
+    for nbytes in (0.0, 2000 * 4000.0):
+        env, comm = crossbar(2, eager=NONE_EAGER)
+        comm.rank(0).isend(1, nbytes, messages=2000)
+        receive = comm.rank(1).irecv()
+        env.run()
+        assert receive.value == Message(0, 0, nbytes, US + LATENCY + round(nbytes / 1e9 * 1e6) * US, 2000)
+
+
 HALF = [{"above": "1 B", "bandwidth": 0.5, "latency": 1}]
 
 
