@@ -155,8 +155,8 @@ def simulate_frames(
     workload : str or Workload
     policy : DistributedCache
     frames : int
-        That count. They follow the policy's ``warm_up`` first ones of the ``path_frames`` of the workload's card; where
-        it does not say how many there are, they lead from the beginning of the path to its end.
+        That count. They follow the policy's ``uncounted`` first ones of the ``path_frames`` of the workload's card;
+        where it does not say how many there are, they lead from the beginning of the path to its end.
     nodes : int, optional
         How many to use, all by default; the last one has the master and the display process, and renders nothing.
     seed : int
@@ -177,7 +177,7 @@ def simulate_frames(
     count = check_processors(card, nodes, None)
     _check(card, workload, policy, frames, count)
     ranks = count - 1
-    views, which = _views(workload, policy.warm_up, frames)
+    views, which = _views(workload, policy.uncounted, frames)
     traces = [view.trace(seed, progress) for view in views]
     sizes = _block_sizes(workload, traces[0], policy)
     hierarchy = _Hierarchy(traces[0], sizes)
@@ -237,7 +237,7 @@ def simulate_frames(
         _report(cluster, traces[k], refers[k], ends[i], cluster.counts[i], hashes[i], weight)
         for i, k in enumerate(which)
     ]
-    measured = reports[policy.warm_up :]
+    measured = reports[policy.uncounted :]
     asked = sum(report.hits + report.misses for report in measured)
     used = [*devices.quantities(), *workload.card.quantities("workload.")]
     if sink is not None and card.display is not None:
@@ -247,14 +247,14 @@ def simulate_frames(
         feasible=True,
         frames_per_s=frames / sum(report.frame_time_s for report in measured),
         miss_rate=sum(report.misses for report in measured) / max(asked, 1),
-        cold=reports[0] if policy.warm_up and not policy.settled else None,
+        cold=reports[0] if policy.uncounted and not policy.settled else None,
         frames=measured,
         links=links(devices),
         sampling_error=rays_error(traces[0], published),
         uncalibrated=owned_up(used),
         scope=_scope(policy, sink),
         event_log_sha256=cluster.timeline.sha256(),
-        images=images[policy.warm_up :],
+        images=images[policy.uncounted :],
         spans=cluster.timeline,
     )
 

@@ -23,7 +23,7 @@ from simrender.hardware.cache import MISS, NODE_BLOCK_BYTES, TRIANGLE_BLOCK_BYTE
 from simrender.hardware.display import Display, message_layout
 from simrender.hardware.machine import Machine, MachineCard
 from simrender.hardware.storage import BlockFetcher
-from simrender.policies.tiles import Stream, TiledFrame
+from simrender.policies.tiles import Stream, TiledFrame, in_turns
 from simrender.timeline import KERNELS, KINDS, Timeline
 
 Steps = Generator[simpy.Event, Any, Any]
@@ -72,7 +72,8 @@ class DistributedCache:
         they begin empty they take hundreds of frames to get there, for dealt tiles come to another node each time.
     warm_up : int
         How many frames are rendered before those that count; the first that does begins when these are complete.
-        After a long look, a camera that moves takes about ten frames to come to the misses that it goes on with.
+        After a long look, a camera that moves takes about ten frames to come to the misses that it goes on with. No
+        more than one is where all data are replicated.
 
     """
 
@@ -94,6 +95,11 @@ class DistributedCache:
     def replicated(self) -> bool:
         """Whether every node has all data."""
         return self.cache == "all"
+
+    @property
+    def uncounted(self) -> int:
+        """How many frames are rendered before those that count; one at most where there are no caches to warm."""
+        return min(self.warm_up, 1) if self.replicated else self.warm_up
 
     def render_threads(self, card: MachineCard) -> int:
         """Return how many threads of a node render."""
@@ -239,7 +245,7 @@ class Cluster:
         """Return what happens when a frame may begin: the display has room, or the one before is rendered."""
         if self.display is None:
             return self._complete[frame - 1] if frame else self.env.timeout(0)
-        measured = 0 < frame == self.policy.warm_up
+        measured = 0 < frame == self.policy.uncounted
         return self.display.complete(frame - 1) if measured else self.display.may_send(frame)
 
     def finish(self, frame: int) -> None:
@@ -399,7 +405,8 @@ class RenderNode:
             self._caches, frame.streams, (NODE_BLOCK_BYTES, TRIANGLE_BLOCK_BYTES), strict=True
         ):
             first, last = stream.first[begin], stream.first[end]
-            refers, order = stream.block[first:last], self._order(stream.first[begin : end + 1] - first)
+            refers = stream.block[first:last]
+            order = in_turns(stream.first[begin : end + 1] - first, self._cluster.policy.packets, self.threads)
             missed = np.sort(order[cache.replay(refers[order]) == MISS])
             of = np.searchsorted(stream.first, missed + first, side="right") - 1
             owners.append(cache.blocks.owner(refers[missed].astype(np.int64)))
@@ -410,18 +417,6 @@ class RenderNode:
         missing, begins = np.unique(of[by_packet], return_index=True)
         parts = np.split(np.concatenate(owners)[by_packet], begins)[1:]
         self._owners.update(zip(missing.tolist(), parts, strict=True))
-
-    def _order(self, first: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Return the order in which references of packets come, as threads that share a cache make them in turn."""
-        run = self._cluster.policy.packets
-        together = run * self.threads
-        references = np.arange(first[-1])
-        if together == 1:
-            return references
-        length = np.diff(first)
-        packet = np.repeat(np.arange(len(length)), length)
-        leader = first[packet // run * run]
-        return np.lexsort((packet // run, references - leader, packet // together))
 
     # -- what threads do ------------------------------------------------------------------------------------------
 

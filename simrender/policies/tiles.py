@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from simrender.rays.blocks import PACKET_SIDE, References, packet_of_pixel, packet_rays
@@ -136,15 +137,16 @@ def tile_frame(
 
     apart = copies if scaled else 1
     lower = (~references.upper, np.ones(references.triangle_blocks, np.bool_))
-    numbers = [np.concatenate([[0], np.cumsum(np.where(each, apart, 1))]) for each in lower]
+    numbers = [np.concatenate([[0], np.cumsum(np.where(each, apart, 1))]).astype(np.int32) for each in lower]
     streams = (
         Stream(references.node_first, references.node).taken(np.repeat(order, copies)),
         Stream(references.triangle_first, references.triangle).taken(np.repeat(order, copies)),
     )
     if apart > 1:
         for stream, each, number in zip(streams, lower, numbers, strict=True):
-            copy = np.repeat(np.tile(np.arange(copies), len(order)), np.diff(stream.first))
-            stream.block[:] = number[stream.block] + np.where(each[stream.block], copy, 0)
+            copy = np.repeat(np.tile(np.arange(copies, dtype=np.int32), len(order)), np.diff(stream.first))
+            copy *= each[stream.block]
+            np.add(number[stream.block], copy, out=stream.block)
     none = np.zeros(0, np.int64)
     by_packet = np.split(rays, begins[1:-1])
     return TiledFrame(
@@ -155,3 +157,40 @@ def tile_frame(
         (int(numbers[0][-1]), int(numbers[1][-1])),
         [by_packet[i] if k == 0 else none for i in order.tolist() for k in range(copies)],
     )
+
+
+def in_turns(first: I64, run: int, threads: int) -> I64:
+    """Return the order in which references come that threads of one cache make in turn.
+
+    Each thread makes those of a run of packets, one after the other; when all are through, they go on to the next runs.
+
+    Parameters
+    ----------
+    first : int64 array (packets + 1,)
+        Where the references of each packet begin.
+    run : int
+        Packets of a run.
+    threads : int
+
+    Returns
+    -------
+    int64 array (references,)
+
+    """
+    order = np.empty(first[-1], np.int64)
+    _take_turns(np.append(first[:-1:run], first[-1]), threads, order)
+    return order
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _take_turns(starts, threads, order):  # type: ignore[no-untyped-def]
+    placed = 0
+    for begin in range(0, len(starts) - 1, threads):
+        end = min(begin + threads, len(starts) - 1)
+        step = 0
+        while placed < starts[end]:
+            for k in range(begin, end):
+                if starts[k] + step < starts[k + 1]:
+                    order[placed] = starts[k] + step
+                    placed += 1
+            step += 1

@@ -13,7 +13,7 @@ from simrender.errors import UsageError
 from simrender.hardware.cache import BlockMap, DirectMappedCache
 from simrender.hardware.machine import Machine, load_machine
 from simrender.policies.distributed_cache import Cluster, DistributedCache, RenderNode
-from simrender.policies.tiles import Stream, TiledFrame, tile_frame
+from simrender.policies.tiles import Stream, TiledFrame, in_turns, tile_frame
 from simrender.rays.blocks import block_hierarchy, references
 from simrender.rays.workload import load_workload
 from tests.scenes import garden_workload
@@ -89,6 +89,20 @@ def test_tiles_and_streams():
     turned = stream.taken(np.array([2, 1, 0]))
     assert turned.first.tolist() == [0, 3, 3, 5]
     assert turned.block.tolist() == [1, 2, 3, 7, 8]
+
+
+def test_threads_refer_in_turns():
+    first = np.array([0, 2, 3, 3, 7, 8])
+    assert in_turns(first, 1, 1).tolist() == in_turns(first, 9, 3).tolist() == list(range(8))
+    assert in_turns(first, 1, 2).tolist() == [0, 2, 1, 3, 4, 5, 6, 7]
+    assert in_turns(first, 2, 2).tolist() == [0, 3, 1, 4, 2, 5, 6, 7]
+    assert in_turns(first, 1, 8).tolist() == [0, 2, 3, 7, 1, 4, 5, 6]
+    assert in_turns(first[:1], 2, 2).tolist() == []
+    rng = np.random.default_rng(3)
+    first = np.concatenate([[0], np.cumsum(rng.integers(0, 9, 100))])
+    packet = np.repeat(np.arange(100), np.diff(first))
+    step = np.arange(first[-1]) - first[packet // 3 * 3]
+    assert np.array_equal(in_turns(first, 3, 5), np.lexsort((packet // 3, step, packet // 15)))
 
 
 def test_a_frame_is_cut_into_tiles(garden):
@@ -261,7 +275,7 @@ def test_nodes_settle_on_the_tiles_they_begin_with(layers):
 
 def test_a_path_has_as_many_frames_as_its_card_says():
     def images(path_frames, frames, warm_up):
-        result = run(interface(f"camera.path_frames={path_frames}"), frames=frames, warm_up=warm_up, cache="all")
+        result = run(interface(f"camera.path_frames={path_frames}"), frames=frames, warm_up=warm_up, cache="60%")
         return [frame.image_sha256 for frame in result.frames]
 
     five = images(5, 5, 0)
@@ -271,6 +285,8 @@ def test_a_path_has_as_many_frames_as_its_card_says():
     assert images(9, 3, 0)[::2] == five[:2]
     assert images(3, 3, 2) == five[2:]  # there are not enough: the path is flown in as many as there have to be
     assert images("null", 3, 2) == five[::2]  # from its beginning to its end, and the first one warms up
+    replicated = run(interface("camera.path_frames=5"), frames=2, warm_up=2, cache="all")
+    assert [frame.image_sha256 for frame in replicated.frames] == five[1:3]  # there is nothing to warm
 
 
 def test_demarles_mapping_wastes_lines(layers):
