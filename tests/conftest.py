@@ -108,3 +108,23 @@ def run_cli(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch)
         return Ran(int(stop.value.code or 0), *capsys.readouterr())
 
     return run
+
+
+@pytest.fixture
+def bad(run_cli: Callable[..., Ran], tmp_path: Path) -> Callable[..., str]:
+    """Run a bad command line; return its one message, after checking that it is one, on stderr alone."""
+    traces = tmp_path / "traces"
+
+    def run(*arguments: object) -> str:
+        command = arguments if arguments[:1] not in {("run",), ("trace",)} else (*arguments, "--cache", traces)
+        ran = run_cli(*command)
+        assert ran.code == 2, ran
+        assert ran.out == ""
+        assert ran.err.startswith("simrender: ")
+        assert ran.err.endswith("\n")
+        assert "Traceback" not in ran.err
+        assert "note:" not in ran.err
+        assert not traces.exists(), "rays were traced before the mistake was found"
+        return ran.err.removeprefix("simrender: ").removesuffix("\n")
+
+    return run

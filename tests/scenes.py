@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from simrender.cards import Document
+from simrender.rays.crossings import Crossings
 from simrender.rays.scene import IDENTITY, Environment, Material, Mesh, PointLight, Scene, SceneObject
 from simrender.rays.workload import Workload
 from simrender.rays.workload_card import WorkloadCard
@@ -83,3 +84,17 @@ def garden_workload(
     """The garden as a workload; the default is traced at its published size."""
     document = Document(CARD.format(published=published, traced=traced, samples=samples), "garden.yaml")
     return Workload("garden", document.validate(WorkloadCard), document, Path(), cache, scene or garden())
+
+
+def check_nearest(crossings: Crossings) -> None:
+    """Of the domains that a ray crosses, the one with the nearest hit has the hit of the trace."""
+    trace = crossings.trace
+    for generation in range(trace.generations):
+        table = crossings.table(generation)
+        hit = crossings.hits(generation, np.arange(len(table["hit"])))
+        assert not np.isnan(hit).any()
+        assert not np.isnan(table["entry"]).any()
+        t = trace.column("t")[trace.first[generation] : trace.first[generation + 1]]
+        least = np.full(len(t), np.inf, np.float32)
+        np.minimum.at(least, np.repeat(np.arange(len(t)), np.diff(table["first"])), hit)
+        assert (least == t).all()

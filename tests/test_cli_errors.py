@@ -12,26 +12,6 @@ TRUNCATED = 100
 """Lines of the bumpy square's PLY file that are left when it is cut."""
 
 
-@pytest.fixture
-def bad(run_cli, tmp_path):
-    """Run a bad command line; return its one message, after checking that it is one, on stderr alone."""
-    traces = tmp_path / "traces"
-
-    def run(*arguments):
-        command = arguments if arguments[:1] not in {("run",), ("trace",)} else (*arguments, "--cache", traces)
-        ran = run_cli(*command)
-        assert ran.code == 2, ran
-        assert ran.out == ""
-        assert ran.err.startswith("simrender: ")
-        assert ran.err.endswith("\n")
-        assert "Traceback" not in ran.err
-        assert "note:" not in ran.err
-        assert not traces.exists(), "rays were traced before the mistake was found"
-        return ran.err.removeprefix("simrender: ").removesuffix("\n")
-
-    return run
-
-
 # Names
 
 

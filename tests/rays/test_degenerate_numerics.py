@@ -17,6 +17,7 @@ from simrender.rays.scene import Environment, Material, Mesh, PointLight
 from simrender.rays.trace import Trace
 from simrender.rays.worlds import SurfaceWorld
 from tests.conftest import bumpy_grid
+from tests.scenes import check_nearest
 from workloads.terrain import generator
 
 GREY = Material((0.6, 0.5, 0.4), mirror=0.2)
@@ -69,16 +70,7 @@ def check(trace, tied=False):
             found = compare(world, domains, bunch)
             assert (found.leaks, found.differences) == (0, 0)
             assert tied or found.ties == 0
-        crossings = Crossings(trace, domains)
-        for generation in range(trace.generations):
-            table = crossings.table(generation)
-            hit = crossings.hits(generation, np.arange(len(table["hit"])))
-            assert not np.isnan(hit).any()
-            assert not np.isnan(table["entry"]).any()
-            t = trace.column("t")[trace.first[generation] : trace.first[generation + 1]]
-            least = np.full(len(t), np.inf, np.float32)
-            np.minimum.at(least, np.repeat(np.arange(len(t)), np.diff(table["first"])), hit)
-            assert (least == t).all()
+        check_nearest(Crossings(trace, domains))
     for generation in range(trace.generations):
         for name, column in trace.geometry(generation).items():
             assert not np.isnan(column).any(), name

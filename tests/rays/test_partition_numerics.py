@@ -14,7 +14,7 @@ from simrender.rays.domains import Domains, from_triangles
 from simrender.rays.integrators import PathTracing
 from simrender.rays.scene import IDENTITY, Mesh, Scene, SceneObject
 from simrender.rays.worlds import SurfaceWorld
-from tests.scenes import garden_workload, sphere
+from tests.scenes import check_nearest, garden_workload, sphere
 
 SMALL = {
     "island": "detail=0.1",
@@ -124,16 +124,7 @@ def test_numerics_the_crossing_table_knows_the_nearest_hit(cut, tmp_path):
     workload = garden_workload("48x32", "48x32", 1, tmp_path)
     trace, domains = workload.trace(), workload.domains(CUTS[cut])
     trace.complete()
-    crossings = Crossings(trace, domains)
-    for generation in range(trace.generations):
-        table = crossings.table(generation)
-        hit = crossings.hits(generation, np.arange(len(table["hit"])))
-        assert not np.isnan(hit).any()
-        assert not np.isnan(table["entry"]).any()
-        t = trace.column("t")[trace.first[generation] : trace.first[generation + 1]]
-        least = np.full(len(t), np.inf, np.float32)
-        np.minimum.at(least, np.repeat(np.arange(len(t)), np.diff(table["first"])), hit)
-        assert (least == t).all()
+    check_nearest(Crossings(trace, domains))
 
 
 def test_numerics_equally_near_hits_go_to_the_lower_triangle_wherever_it_lies():
