@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from simrender.clock import to_seconds
 from simrender.errors import InvariantError, UsageError
-from simrender.hardware.cache import DomainCache
 from simrender.hardware.machine import Machine, MachineCard
-from simrender.policies.domain_frame import DomainFrame, DomainPolicy, Event, cache_capacity, stripes
+from simrender.policies.domain_frame import DomainFrame, DomainPolicy, Event, domain_cache, stripes
 from simrender.policies.domain_rank import DomainRank
 from simrender.policies.islands import Fit, fit
 from simrender.rays.domains import Domains, morton_ranks
@@ -39,8 +38,10 @@ def place(card: MachineCard, domains: Domains, policy: DomainPolicy, ranks: int,
             held = np.bincount(owner, sizes, minlength=size)
             copies = min(getattr(policy, "copies", 1), size)
             return np.tile(np.sum([np.roll(held, k) for k in range(copies)], axis=0), count)
-        # A slot of the cache is as large as the largest domain.
-        return np.full(count * size, cache_capacity(policy.cache, domains.count) * float(sizes.max()))
+        cache = domain_cache(policy.cache, sizes.tolist())
+        # A slot of a cache that counts domains is as large as the largest one.
+        slot = float(sizes.max()) if cache.unit == "domains" else 1.0
+        return np.full(count * size, cache.capacity * slot)
 
     return fit(ranks, islands, need, capacity, replicated=not policy.in_situ)
 
@@ -127,6 +128,7 @@ def render(
             "domains": domains.count,
             **counters,
         },
+        busy_over_time=timeline.busy_share(int(env.now)).tolist(),
         sampling_error=rays_error(trace, workload.card.published.resolution),
         uncalibrated=owned_up([*devices.quantities(), *workload.card.quantities("workload.")]),
         scope=_scope(devices, policy),
@@ -160,12 +162,11 @@ def _frame(
     rank_of_pixel = np.full(trace.pixels, -1, np.int64)
     rank_of_pixel[mine] = stripes((trace.size[0], len(mine) // trace.size[0]), size)
     sizes = loaded_bytes(devices.card, domains).tolist()
-    capacity = cache_capacity(policy.cache, domains.count)
     return DomainFrame(
         env, devices, crossings, workload.visits(crossings), policy, timeline,
         devices.communicator(list(range(first, first + size))) if size > 1 else None,
         owners(policy, domains, size) if policy.in_situ else None,
-        rank_of_pixel, [DomainCache(sizes, capacity) for _ in range(size)],
+        rank_of_pixel, [domain_cache(policy.cache, sizes) for _ in range(size)],
         workload.weight * workload.repeats, workload.card.published.resolution, first, other,
     )  # fmt: skip
 

@@ -54,6 +54,8 @@ class Result:
     frame_time_s : float or None
     utilization : dict
         Share of the frame during which each device computes.
+    busy_over_time : list of float
+        Share of the processors that run kernels, in each hundredth of the frame.
     breakdown : dict
         Share of the frame that an average GPU spends on each kind of work, on copies, and waiting. Sums to 1.
     links : dict
@@ -90,6 +92,7 @@ class Result:
     memory: dict[str, Any]
     frame_time_s: float | None = None
     utilization: dict[str, float] = field(default_factory=dict)
+    busy_over_time: list[float] = field(default_factory=list)
     links: dict[str, dict[str, float]] = field(default_factory=dict)
     breakdown: dict[str, float] = field(default_factory=dict)
     counts: dict[str, float] = field(default_factory=dict)

@@ -172,6 +172,7 @@ def simulate(
         **facts,
         frame_time_s=frame_time_s,
         utilization={p.name: to_seconds(p.busy_ticks) / frame_time_s for p in devices.processors},
+        busy_over_time=frame.timeline.busy_share(int(env.now)).tolist(),
         links=carried,
         breakdown=breakdown(frame.timeline, frame_time_s),
         counts=counts(frame, devices),

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from simrender.clock import TICKS_PER_SECOND
 
@@ -92,6 +93,33 @@ class Timeline:
         )
         order = np.lexsort((np.array(self.device), np.array(self.start)))
         return table.iloc[order].reset_index(drop=True)
+
+    def busy_share(self, end: int, parts: int = 100) -> NDArray[np.float64]:
+        """Return the share of the processors that run kernels, in each of equal parts of the time until a tick.
+
+        Parameters
+        ----------
+        end : int
+        parts : int
+
+        Returns
+        -------
+        float64 array (parts,)
+
+        """
+        kernel = np.array(self.kind, dtype=int) < len(KERNELS)
+        edges = np.linspace(0.0, float(end), parts + 1)
+
+        def since(ticks: list[int]) -> NDArray[np.float64]:
+            moments = np.sort(np.array(ticks, dtype=float)[kernel])
+            passed = np.searchsorted(moments, edges)
+            before: NDArray[np.float64] = np.concatenate([[0.0], np.cumsum(moments)])[passed]
+            gone: NDArray[np.float64] = passed * edges - before
+            return gone
+
+        busy: NDArray[np.float64] = np.diff(since(self.start) - since(self.end))
+        share: NDArray[np.float64] = np.clip(busy / max(self.gpus * float(end) / parts, 1.0), 0.0, 1.0)
+        return share
 
     def seconds_by_kind(self) -> dict[str, list[float]]:
         """Return, for each kind of span, the seconds that each GPU spent on it."""

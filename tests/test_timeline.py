@@ -156,3 +156,11 @@ def test_the_log_has_no_column_that_the_hash_could_miss():
     """Whoever adds one must add it to the hash, to the table and to this list."""
     fields = [field.name for field in dataclasses.fields(Timeline)]
     assert fields == ["gpus", "names", "device", "kind", "start", "end", "nbytes", "rays"]
+
+
+def test_the_busy_share_counts_kernels_in_each_part_of_the_time():
+    # Of three processors two trace for two seconds, and one for another; then it sends.
+    assert timeline().busy_share(4 * SECOND, 4) == pytest.approx([2 / 3, 2 / 3, 1 / 3, 0.0], abs=1e-9)
+    assert timeline().busy_share(4 * SECOND, 1) == pytest.approx([5 / 12])
+    assert timeline([]).busy_share(SECOND, 2).tolist() == [0.0, 0.0]
+    assert timeline([]).busy_share(0, 2).tolist() == [0.0, 0.0]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -10,6 +10,7 @@ import numpy as np
 import simpy
 from numpy.typing import NDArray
 
+from simrender.errors import UnitError
 from simrender.hardware.cache import DomainCache
 from simrender.hardware.collectives import Communicator
 from simrender.hardware.machine import Machine
@@ -17,6 +18,7 @@ from simrender.rays.crossings import Crossings
 from simrender.rays.kinds import CAMERA, SHADOW
 from simrender.rays.visits import Visits
 from simrender.timeline import Timeline
+from simrender.units import BYTES, format_bytes, parse
 
 if TYPE_CHECKING:
     from simrender.policies.domain_rank import DomainRank
@@ -35,7 +37,7 @@ class DomainPolicy(Protocol):
 
     @property
     def cache(self) -> str | int:
-        """How much of the data a rank's domain cache holds; see `cache_capacity`."""
+        """How much of the data a rank's domain cache holds; see `domain_cache`."""
 
     @property
     def threads(self) -> int | None:
@@ -234,25 +236,41 @@ def stripes(size: tuple[int, int], ranks: int) -> NDArray[np.int64]:
     return np.minimum(up // lines, ranks - 1) if lines else np.minimum(up, ranks - 1)
 
 
-def cache_capacity(cache: str | int, domains: int) -> int:
-    """Return how many domains a cache holds that is given as a number of them, or a share such as ``25%``.
+def domain_cache(cache: str | int, nbytes: Sequence[float]) -> DomainCache:
+    """Return an empty cache of so many domains, a share of them such as ``25%``, or a size such as ``8 GB``.
 
     A share is rounded to the nearest whole number of domains; a cache holds one at least.
+
+    Parameters
+    ----------
+    cache : str or int
+    nbytes : sequence of float
+        What each domain takes.
 
     Raises
     ------
     ValueError
-        If it is neither.
+        If it is nothing of these, or too small for a domain.
 
     """
-    text = str(cache).strip()
+    text, domains = str(cache).strip(), max(1, len(nbytes))
     if text == "all":
-        return max(1, domains)
+        return DomainCache(nbytes, domains)
     if text.endswith("%"):
         share = float(text[:-1])
         if not 0.0 < share <= 100.0:
             raise ValueError(f"expected a share of the domains above 0% and up to 100%, got {cache!r}")
-        return max(1, round(domains * share / 100.0))
-    if not text.isdigit() or int(text) < 1:
-        raise ValueError(f"expected a number of domains from 1 on, a share such as 25%, or all, got {cache!r}")
-    return min(int(text), max(1, domains))
+        return DomainCache(nbytes, max(1, round(domains * share / 100.0)))
+    if text.isdigit() and int(text) >= 1:
+        return DomainCache(nbytes, min(int(text), domains))
+    try:
+        size = parse(text, BYTES)
+    except UnitError:
+        size = 0.0
+    if size <= 0.0 or text.isdigit():
+        raise ValueError(
+            f"expected a number of domains from 1 on, a share such as 25%, a size such as 8 GB, or all, got {cache!r}"
+        )
+    if max(nbytes, default=0.0) > size:
+        raise ValueError(f"the largest domain takes {format_bytes(max(nbytes))} with its acceleration structure")
+    return DomainCache(nbytes, size, unit="bytes")

@@ -34,7 +34,8 @@ class LoadAnyOnce:
         takes the fullest of its own domains (SpRay, 5). Or the i-th fullest domain of all goes to rank i, which loads
         it, and rays travel as well (Navratil et al.).
     cache : str
-        Domains in a rank's cache: a number, a share such as 25%, or all. Least recently used ones make room.
+        Domains in a rank's cache: a number, a share such as 25%, a size such as 8 GB, or all. Least recently used ones
+        make room.
     prefer_cached : bool
         Take the fullest domain in the cache before any other.
     ray_bytes : float

@@ -42,8 +42,8 @@ class LoadOnce:
     Parameters
     ----------
     cache : str
-        Domains that a rank has loaded at a time: a number, a share such as 25%, or all; one in the original. Of several
-        a rank goes on with the one with most rays.
+        Domains that a rank has loaded at a time: a number, a share such as 25%, a size such as 8 GB, or all; one in the
+        original. Of several a rank goes on with the one with most rays.
     ray_bytes : float
         Size of a ray in a message: 80 B in GraviT.
     threads : int, optional

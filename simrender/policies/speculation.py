@@ -45,7 +45,8 @@ class Speculation:
         Every rank renders its stripe of the image and loads domains into its cache (4.1). Or each domain stays with its
         owner, blocks in Morton order, and rays go to all owners at once (4.2).
     cache : str
-        Domains in a rank's cache: a number, a share such as 25%, or all. Least recently used ones make room.
+        Domains in a rank's cache: a number, a share such as 25%, a size such as 8 GB, or all. Least recently used ones
+        make room.
     history_depth : int, optional
         Hits of a path that may be guesses, H; as many as a path can have, by default, as in the paper. In situ it is 1.
     tiles : int or "auto"

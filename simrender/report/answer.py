@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
@@ -24,6 +25,7 @@ _BARS = {
 """Told apart without colours too."""
 
 _BAR = 48
+_LEVELS = " ▁▂▃▄▅▆▇█"
 
 
 def answer(result: Result) -> RenderableType:
@@ -42,6 +44,7 @@ def answer(result: Result) -> RenderableType:
     table.add_row("islands", _islands(result))
     table.add_row("memory", _memory(result))
     table.add_row("where the time went", _bar(result.breakdown))
+    table.add_row("busy over time", _course(result))
     if result.busiest_link:
         table.add_row("busiest link", _busiest(result, result.busiest_link))
     if any(what.startswith("staging") for what in result.scope["modelled"]):
@@ -98,6 +101,12 @@ def _bar(breakdown: dict[str, float]) -> Text:
         text.append(glyph * cells, style=color)
     words = ", ".join(f"{_BARS[name][0]} {name} {share:.0%}" for name, share in breakdown.items())
     return text.append(f"\n{words}", style="default")
+
+
+def _course(result: Result) -> str:
+    """Return the share of the processors that compute as the frame goes on, in as many steps as the bar has cells."""
+    parts = np.array_split(np.array(result.busy_over_time), _BAR)
+    return "".join(_LEVELS[round(float(part.mean()) * (len(_LEVELS) - 1))] for part in parts)
 
 
 def _busiest(result: Result, name: str) -> str:

@@ -8,9 +8,8 @@ import numpy as np
 import simpy
 from hypothesis import strategies as st
 
-from simrender.hardware.cache import DomainCache
 from simrender.hardware.machine import Machine, load_machine
-from simrender.policies.domain_frame import DomainFrame, DomainPolicy, cache_capacity, stripes
+from simrender.policies.domain_frame import DomainFrame, DomainPolicy, domain_cache, stripes
 from simrender.policies.domain_rank import DomainRank
 from simrender.rays.crossings import Crossings
 from simrender.rays.domains import morton_ranks
@@ -90,7 +89,6 @@ def play(
     domains = crossings.domains
     if policy.in_situ and owner is None:
         owner = morton_ranks(domains.low, domains.high, ranks)
-    capacity = cache_capacity(policy.cache, domains.count)
     frame = DomainFrame(
         env,
         machine,
@@ -101,7 +99,7 @@ def play(
         machine.communicator(list(range(ranks))) if ranks > 1 else None,
         owner.astype(np.int64) if policy.in_situ else None,
         stripes(crossings.trace.size, ranks) if pixels is None else pixels,
-        [DomainCache(domains.bytes.tolist(), capacity) for _ in range(ranks)],
+        [domain_cache(policy.cache, domains.bytes.tolist()) for _ in range(ranks)],
         1.0,
         crossings.trace.size,
     )

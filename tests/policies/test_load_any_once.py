@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from simrender import simulate
-from simrender.policies.domain_frame import stripes
+from simrender.errors import UsageError
+from simrender.policies.domain_frame import domain_cache, stripes
 from simrender.policies.load_any_once import LoadAnyOnce
 from simrender.policies.queues import DomainQueues, fullest
 from simrender.rays.crossings import Crossings
@@ -309,3 +310,37 @@ def test_the_fullest_of_equal_queues_is_the_lowest():
     assert fullest(counts, [2]) is None
     assert fullest(counts, []) is None
     assert fullest(np.zeros(4, np.int64)) is None
+
+
+def test_a_cache_is_so_many_domains_a_share_of_them_or_a_size():
+    nbytes = [3e9, 1e9, 2e9, 2e9]
+    assert [domain_cache(given, nbytes).capacity for given in (3, "3", 9, "50%", "1%", "all")] == [3, 3, 4, 2, 1, 4]
+    by_size = domain_cache("5 GB", nbytes)
+    assert (by_size.capacity, by_size.unit) == (5e9, "bytes")
+    assert by_size.replay([0, 2, 1]).all()
+    assert by_size.resident == [2, 1]
+    for wrong in (0, "0", "0%", "101%", "-1 GB", "0 B", "many", "3 s"):
+        with pytest.raises(ValueError, match=r"^expected a "):
+            domain_cache(wrong, nbytes)
+    with pytest.raises(ValueError, match=r"^the largest domain takes 3 GB with its acceleration structure$"):
+        domain_cache("2.5 GB", nbytes)
+
+
+def test_a_cache_of_a_size_holds_what_fits():
+    crossings = wavelets()
+    size = sum(crossings.domains.bytes.tolist())
+    whole, every = (play(LoadAnyOnce(cache=cache), crossings) for cache in (f"{size:.0f} B", "all"))
+    assert whole.counters == every.counters
+    loads = [play(LoadAnyOnce(cache=f"{share * size:.0f} B"), crossings).counters.loads for share in (0.5, 0.25, 0.1)]
+    assert every.counters.loads < loads[0] < loads[1] < loads[2] <= 85
+    result = simulate("stampede2-skx", WAVELETS, LoadAnyOnce(cache="5 GB"), nodes=1)
+    assert result.memory["model_bytes"] == 5e9
+    with pytest.raises(UsageError, match=r"^policy.cache=1 B: the largest domain takes "):
+        simulate("stampede2-skx", WAVELETS, LoadAnyOnce(cache="1 B"), nodes=1)
+
+
+def test_the_busy_share_over_time_is_what_the_ranks_compute():
+    result = simulate("stampede2-skx", WAVELETS, LoadAnyOnce("in_situ"), nodes=4, islands=1)
+    assert len(result.busy_over_time) == 100
+    assert np.mean(result.busy_over_time) == pytest.approx(np.mean(list(result.utilization.values())), rel=1e-6)
+    assert 0.0 <= min(result.busy_over_time) < max(result.busy_over_time) <= 1.0
