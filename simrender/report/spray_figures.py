@@ -77,6 +77,8 @@ def _bars(axes: Axes, runs: Sequence[Run], title: str) -> None:
             )  # fmt: skip
     else:
         axes.set_xlabel("nodes", fontsize=8)
+    # Parts without a height would let the axes end where the tallest bar does.
+    axes.set_ylim(0.0, 1.05 * max(r.frame_time_s for r in runs))
     axes.set_title(title, fontsize=9, loc="left")
     axes.set_ylabel("s a frame", fontsize=8)
     axes.tick_params(labelsize=7)
