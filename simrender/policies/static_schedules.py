@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-import numpy as np
 from pydantic import ConfigDict, Field
 
 from simrender.policies.domain_frame import Steps
@@ -72,13 +71,12 @@ class DomainSchedule:
 
     def rank(self, me: DomainRank) -> Steps:
         """Render one frame."""
-        owner = np.zeros(len(me.queues.counts), np.int64)
-        for rank, owned in enumerate(me.owned_by_rank):
-            owner[owned] = rank
+        owner = me.frame.owner
+        assert owner is not None  # noqa: S101 - domains stay with ranks
         me.enqueue(me.camera_rays())
         while True:
             me.count_step()
-            yield from visit_all(me, lambda: fullest(me.queues.counts, me.owned.tolist()))
+            yield from visit_all(me, lambda: fullest(me.queues.counts, me.owned))
             yield from deliver(me, owner, self.ray_bytes)
             if not (yield from me.any(mine=me.queues.any())):
                 break
