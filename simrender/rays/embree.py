@@ -4,6 +4,11 @@ embreex offers single rays against one level of triangle geometry, in float32, s
 the distances it is given and releases the GIL. Everything here follows from that: scenes are written out without
 instances, secondary origins are offset before they come here, and batches are cut into chunks that run on all cores.
 Scenes are always built robust: without it, rays through shared edges leak between the triangles.
+
+Robust as they are, they still lose rays that lie in the plane of a box. Embree takes a direction's component of 0 for
+one of +1e-18, and to such a ray all boxes that *end* in its plane are closed, the triangles in that plane with them.
+So what a ray along a face between two domains hits would hang on where the hierarchy has its boxes. `Geometry.nearest`
+asks for such rays with both signs.
 """
 
 from __future__ import annotations
@@ -13,6 +18,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
+from itertools import product
 from typing import Any, TypeVar
 
 import numpy as np
@@ -20,11 +26,16 @@ from numpy.typing import NDArray
 
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
+Ids = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 A = TypeVar("A")
 B = TypeVar("B")
 
 CHUNK = 1 << 14
 """Rays a thread takes at once: small enough to stay in its cache, large enough to hide Python."""
+
+_NOTHING = np.float32(1e-17)
+"""A component of a direction that is too small to change a hit, and just large enough for Embree to see its sign."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +57,11 @@ class Hits:
     primitive: I32
     u: F32
     v: F32
+
+    @property
+    def columns(self) -> tuple[F32, I32, F32, F32]:
+        """All of it, in order."""
+        return self.t, self.primitive, self.u, self.v
 
 
 class Geometry:
@@ -77,6 +93,27 @@ class Geometry:
             How far each ray goes; not changed.
 
         """
+        found = self._query(origins, directions, reach)
+        flat = directions == 0.0
+        rows = np.flatnonzero(flat.any(axis=1))
+        if len(rows):
+            self._ask_again(found, origins, directions, reach, rows, flat[rows])
+        return found
+
+    def _ask_again(self, found: Hits, origins: F32, directions: F32, reach: F32, rows: Ids, flat: Mask) -> None:
+        """Let rays within axis planes meet what they meet with the other sign of 0, where that is nearer."""
+        for signs in list(product((False, True), repeat=3))[1:]:
+            bent = rows[(flat | ~np.array(signs)).all(axis=1)]
+            if len(bent) == 0:
+                continue
+            direction = np.where(signs, -_NOTHING, directions[bent])
+            other = self._query(origins[bent], direction, reach[bent])
+            t, primitive = found.t[bent], found.primitive[bent]
+            nearer = (other.t < t) | ((other.t == t) & (other.primitive < primitive))
+            for mine, its in zip(found.columns, other.columns, strict=True):
+                mine[bent[nearer]] = its[nearer]
+
+    def _query(self, origins: F32, directions: F32, reach: F32) -> Hits:
         found = self.raw(origins, directions, reach)
         t, primitive = found["tfar"], found["primID"]
         t[primitive < 0] = np.inf

@@ -9,6 +9,7 @@ from simrender import load_workload
 from simrender.accuracy.partitions import CUTS, aimed_rays, bundle, compare, nearest, partitions, path_rays, random_rays
 from simrender.accuracy.stability import escapes
 from simrender.errors import SceneError
+from simrender.rays import embree
 from simrender.rays.crossings import Crossings
 from simrender.rays.domains import Domains, from_triangles
 from simrender.rays.integrators import PathTracing
@@ -26,7 +27,7 @@ SMALL = {
     "wavelets": "across=2",
 }
 RANDOM = 40_000
-LOOSE, EXACT, SKEW = ("paths", "random"), ("vertices", "edges", "axis-parallel", "diagonal"), "faces"
+LOOSE, AIMED = ("paths", "random"), ("vertices", "edges", "axis-parallel", "diagonal", "faces")
 COPLANAR = {"museum", "boeing"}  # feet stand in the plane of the floor: of two triangles at one place either is seen
 
 
@@ -57,27 +58,31 @@ def test_numerics_a_million_rays_in_general_position_hit_the_same_whatever_the_p
     assert total(rows, "hits") > 0.5 * total(rows, "rays")
 
 
-def test_watertight_no_ray_at_a_vertex_or_an_edge_leaks_between_domains(table, record_property):
-    for aim in EXACT:
+def test_watertight_no_ray_at_a_vertex_an_edge_or_a_face_leaks_between_domains(table, record_property):
+    for aim in AIMED:
         rows = [row for row in table if row["aim"] == aim]
-        assert total(rows, "rays") > 50_000
-        assert total(rows, "leaks") == 0
-        # Next to a vertex another surface may begin, and a ray that grazes it may take either.
-        assert total(rows, "strays") <= 3e-4 * total(rows, "rays")
+        assert total(rows, "rays") > 100_000
+        assert (total(rows, "leaks"), total(rows, "strays")) == (0, 0)
         record_property(f"ties at {aim}", total(rows, "ties"))
 
 
 def test_watertight_rays_through_a_surface_at_its_vertices_hit_it(table):
-    rows = [row for row in table if row["aim"] in EXACT[2:]]
-    # A handful of a hundred thousand slips through Embree's one hierarchy over everything as well.
+    rows = [row for row in table if row["aim"] in AIMED[2:]]
+    # A handful of a hundred thousand slips past a vertex, and does so however the scene is cut.
     assert total(rows, "rays") - total(rows, "hits") <= 1e-4 * total(rows, "rays")
 
 
-def test_watertight_rays_askew_in_a_face_between_domains_leak_hardly_ever(table):
-    """Where a ray lies in the plane of a box to the digit, and passes a vertex within a rounding, Embree may miss."""
-    rows = [row for row in table if row["aim"] == SKEW]
-    assert total(rows, "leaks") <= 3e-4 * total(rows, "rays")
-    assert total(rows, "strays") <= 1e-3 * total(rows, "rays")
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_watertight_a_ray_within_the_plane_in_which_a_domain_begins_or_ends_is_not_lost(axis, side):
+    """Triangles one behind the other end in the plane of the ray: Embree alone sees them on one side only."""
+    corners = np.float32([[0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [side, 0.0, 0.0]])
+    behind = np.float32([0.0, 1.0, 0.0]) * np.arange(32, dtype=np.float32)[:, None, None]
+    geometry = embree.Geometry(np.roll((corners + behind).reshape(-1, 3), axis, axis=1), np.arange(96).reshape(-1, 3))
+    for sign in (1.0, -1.0):
+        start, along = np.roll([0.0, 15.5 - 18.5 * sign, 0.25], axis), np.roll([0.0, sign, 0.0], axis)
+        t, primitive = nearest(geometry, bundle(start[None], along[None]))
+        assert (t.tolist(), primitive.tolist()) == ([3.0], [0 if sign > 0 else 31])
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +151,7 @@ def test_aimed_rays_pass_through_what_they_are_aimed_at():
     workload = garden_workload()
     domains = workload.domains(CUTS[1])
     aims = aimed_rays(workload.scene, domains, 500)
-    assert set(aims) == {*EXACT, SKEW}
+    assert set(aims) == set(AIMED)
     vertices = workload.scene.triangles.vertices.astype(np.float64)
     for aim in ("axis-parallel", "diagonal"):
         rays = {name: column.astype(np.float64) for name, column in aims[aim].items()}
@@ -155,7 +160,7 @@ def test_aimed_rays_pass_through_what_they_are_aimed_at():
         gap = np.abs(middle[:, None] - vertices).max(axis=2).min(axis=1)
         assert gap.max() < 1e-5
     assert (np.sort(np.abs(aims["axis-parallel"]["direction"]), axis=1) == [0.0, 0.0, 1.0]).all()
-    assert (aims[SKEW]["direction"] == 0.0).any(axis=1).all()
+    assert (aims["faces"]["direction"] == 0.0).any(axis=1).all()
 
 
 def test_the_rays_of_a_frame_are_those_of_the_camera_and_all_that_they_spawn(tmp_path):
