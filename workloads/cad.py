@@ -231,10 +231,12 @@ def about_x(position: Sequence[float] | F64, angle: F64) -> F32:
     return axes(at, np.broadcast_to(X, at.shape), np.cos(a) * Y + np.sin(a) * Z, np.cos(a) * Z - np.sin(a) * Y)
 
 
-def mesh(solid: Solid, material: int, *, smooth: bool = False, colors: F64 | None = None) -> Mesh:
+def mesh(
+    solid: Solid, material: int, *, smooth: bool = False, colors: F64 | None = None, uv: F64 | None = None
+) -> Mesh:
     """Return a solid as a mesh."""
-    dyes = None if colors is None else colors.astype(np.float32)
-    return Mesh(solid[0].astype(np.float32), solid[1].astype(np.int32), material, dyes, smooth)
+    dyes, places = (None if column is None else column.astype(np.float32) for column in (colors, uv))
+    return Mesh(solid[0].astype(np.float32), solid[1].astype(np.int32), material, dyes, smooth, places)
 
 
 def part(name: str, *solids: tuple[int, Solid], smooth: bool = False) -> SceneObject:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from simrender.rays.scene import SceneObject
+from simrender.rays.scene import SceneObject, Texture, texture
 from workloads.cad import (
     Solid,
     X,
@@ -172,26 +172,31 @@ def vase(seed: int, name: str, *, triangles: int, height: float, glaze: int) -> 
 
 
 def painting(
-    seed: int, name: str, *, triangles: int, width: float, height: float, canvas: int, gilt: int
-) -> SceneObject:
-    """Paint a landscape, a portrait or fields of color, and frame it; it hangs in the plane y = 0, seen from -y."""
+    seed: int, name: str, *, triangles: int, texels: float, width: float, height: float, canvas: int, gilt: int
+) -> tuple[SceneObject, Texture]:
+    """Paint a landscape, a portrait or fields of color, and frame it; it hangs in the plane y = 0, seen from -y.
+
+    The picture is a texture of so many texels a metre for the material ``canvas``.
+    """
     rng = generator(seed, name)
-    columns = max(4, round(float(np.sqrt(0.5 * triangles * width / height))))
-    rows = max(4, round(0.5 * triangles / columns))
-    u, v = np.meshgrid(np.arange(columns + 1) / columns, np.arange(rows + 1) / rows)
+    across, down = max(8, round(texels * width)), max(8, round(texels * height))
+    u, v = np.meshgrid((np.arange(across) + 0.5) / across, 1.0 - (np.arange(down) + 0.5) / down)
     subject = (_landscape, _portrait, _fields)[int(rng.integers(0, 3))]
     colors = subject(rng, Noise(seed, name), u * width / height, v)
     strokes = 0.05 * Noise(seed, f"{name} strokes")(6.0 * u, 30.0 * v, 0.5, 3)
-    colors = np.clip(colors * (1.0 + 2.0 * strokes[..., None]), 0.01, 0.9)
+    picture = texture(np.clip(colors * (1.0 + 2.0 * strokes[..., None]), 0.01, 0.9))
+    columns = max(4, round(float(np.sqrt(0.5 * triangles * width / height))))
+    rows = max(4, round(0.5 * triangles / columns))
+    u, v = np.meshgrid(np.arange(columns + 1) / columns, np.arange(rows + 1) / rows)
     grid = np.stack([width * (u - 0.5), np.full_like(u, -0.02), height * (v - 0.5)], axis=2)
-    cloth = mesh(sheet(grid), canvas, colors=colors.reshape(-1, 3))
+    cloth = mesh(sheet(grid), canvas, uv=np.stack([u, v], axis=2).reshape(-1, 2))
     # Mitred: each point of the moulding goes around the picture at its own distance from the edge.
     moulding = np.array([[-0.01, -0.03], [0.015, -0.045], [0.03, -0.04], [0.05, -0.075], [0.09, -0.085], [0.11, -0.06],
                          [0.125, -0.065], [0.14, 0.0]])  # fmt: skip
     corner = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0]])
     out = corner[:, None] * (0.5 * np.array([width, height]) + moulding[None, :, :1])
     frame = np.stack([out[..., 0], np.broadcast_to(moulding[:, 1], out.shape[:2]), out[..., 1]], axis=2)
-    return SceneObject(name, (cloth, mesh(sheet(frame), gilt)))
+    return SceneObject(name, (cloth, mesh(sheet(frame), gilt))), picture
 
 
 def _landscape(rng: np.random.Generator, noise: Noise, u: F64, v: F64) -> F64:

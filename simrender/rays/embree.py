@@ -26,8 +26,6 @@ from numpy.typing import NDArray
 
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
-Ids = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 A = TypeVar("A")
 B = TypeVar("B")
 
@@ -94,16 +92,15 @@ class Geometry:
 
         """
         found = self._query(origins, directions, reach)
-        flat = directions == 0.0
-        rows = np.flatnonzero(flat.any(axis=1))
-        if len(rows):
-            self._ask_again(found, origins, directions, reach, rows, flat[rows])
+        if not directions.all():
+            self._ask_again(found, origins, directions, reach)
         return found
 
-    def _ask_again(self, found: Hits, origins: F32, directions: F32, reach: F32, rows: Ids, flat: Mask) -> None:
+    def _ask_again(self, found: Hits, origins: F32, directions: F32, reach: F32) -> None:
         """Let rays within axis planes meet what they meet with the other sign of 0, where that is nearer."""
+        flat = directions == 0.0
         for signs in list(product((False, True), repeat=3))[1:]:
-            bent = rows[(flat | ~np.array(signs)).all(axis=1)]
+            bent = np.flatnonzero((flat | ~np.array(signs)).all(axis=1))
             if len(bent) == 0:
                 continue
             direction = np.where(signs, -_NOTHING, directions[bent])

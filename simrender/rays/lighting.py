@@ -53,8 +53,7 @@ def shade(
     spawned = _light(
         rays["direction"], rays["throughput"], rays["pixel"], rays["sample"], rays["kind"],
         rays["diffuse"], hits.primitive, hits.u, hits.v,
-        surfaces.vertices, surfaces.faces, surfaces.normals, surfaces.colors, surfaces.material, surfaces.materials,
-        surfaces.points, surfaces.hemispheres, surfaces.light_first, surfaces.light_rows,
+        surfaces.looks, surfaces.points, surfaces.hemispheres, surfaces.light_first, surfaces.light_rows,
         ambient, each, distance, *shine, light.bounces, np.uint64(seed), *(light.program_image or (0, 0, 0)),
         radiance, children, out["origin"], out["origin"].view(np.int32), out["direction"], out["throughput"],
         out["reach"], out["parent"], out["kind"],
@@ -116,7 +115,7 @@ def _program_direction(number, pair, nx, ny, nz):  # type: ignore[no-untyped-def
 @njit(cache=True, nogil=True, error_model="numpy")
 def _light(  # type: ignore[no-untyped-def]
     direction, throughput, pixel, sample, kind, depth, primitive, u, v,
-    vertices, faces, normals, colors, material_of, materials, points, hemispheres, light_first, light_rows,
+    looks, points, hemispheres, light_first, light_rows,
     ambient, each, distance, specular, shininess, bounces, seed, width, height, samples,
     radiance, children, out_origin, out_bits, out_direction, out_throughput, out_reach, out_parent, out_kind,
 ):  # fmt: skip
@@ -135,25 +134,14 @@ def _light(  # type: ignore[no-untyped-def]
             continue
         dx, dy, dz = np.float64(direction[i, 0]), np.float64(direction[i, 1]), np.float64(direction[i, 2])
         px, py, pz, gx, gy, gz, sx, sy, sz, ar, ag, ab = surface_point(
-            primitive[i],
-            np.float64(u[i]),
-            np.float64(v[i]),
-            dx,
-            dy,
-            dz,
-            vertices,
-            faces,
-            normals,
-            colors,
-            material_of,
-            materials,
+            primitive[i], np.float64(u[i]), np.float64(v[i]), dx, dy, dz, looks
         )
         if gx == 0.0 and gy == 0.0 and gz == 0.0:
             continue  # a degenerate triangle has no side to scatter to
-        m = material_of[primitive[i]]
+        m = looks.material[primitive[i]]
         if depth[i] == 0:
             for c in range(3):
-                radiance[i, c] = throughput[i, c] * materials[m, 4 + c]
+                radiance[i, c] = throughput[i, c] * looks.materials[m, 4 + c]
         tr, tg, tb = np.float64(throughput[i, 0]), np.float64(throughput[i, 1]), np.float64(throughput[i, 2])
         key = path_key(seed, pixel[i], sample[i], 1 + depth[i])
         number = 0

@@ -10,16 +10,13 @@ from typing import Any
 import numpy as np
 
 from simrender.errors import SceneError
-from simrender.rays.scene import IDENTITY, Environment, Material, Mesh, PointLight, Scene, SceneObject
+from simrender.rays.scene import GAMMA, IDENTITY, Environment, Material, Mesh, PointLight, Scene, SceneObject, Texture
 
 FORMATS = (".ply", ".obj", ".glb", ".gltf", ".stl")
 """Endings of the files that are read."""
 
 _PARTS = 64
 """A scanned mesh has no objects to deal to GPUs, so it is cut into this many meshes, in the order of its faces."""
-
-_GAMMA = 2.2
-"""Colors in mesh files are meant for a display; scenes hold reflectances."""
 
 _DAMAGED = "cannot read this mesh, which is damaged or cut short"
 
@@ -33,7 +30,7 @@ def read_scene(path: Path) -> Scene:
     ----------
     path : Path
         A file of one of the `FORMATS`. A file with a scene graph keeps its instances; single meshes are cut into parts
-        that a partition can deal out.
+        that a partition can deal out. Materials keep their color and the image that it is multiplied by.
 
     Raises
     ------
@@ -110,9 +107,12 @@ def _one_mesh(loaded: Any) -> Mesh:
 def _from_mesh(loaded: Any, path: Path) -> Scene:
     mesh = _one_mesh(loaded)
     if mesh.colors is not None:
-        mesh = replace(mesh, colors=mesh.colors ** np.float32(_GAMMA))
-    thing = SceneObject(path.stem, _cut(mesh, _PARTS))
-    return _lit((thing,), np.zeros(1, np.int32), IDENTITY[None], (_material(loaded),), path.suffix.lower() in _Y_UP)
+        mesh = replace(mesh, colors=mesh.colors ** np.float32(GAMMA))
+    textures: list[Texture] = []
+    material, uv = _material(loaded, textures)
+    thing = SceneObject(path.stem, _cut(replace(mesh, uv=uv), _PARTS))
+    y_up = path.suffix.lower() in _Y_UP
+    return _lit((thing,), np.zeros(1, np.int32), IDENTITY[None], (material,), textures, y_up)
 
 
 def _check_length(elements: Any) -> None:
@@ -210,15 +210,17 @@ def _from_graph(graph: Any) -> Scene:
         raise SceneError("nothing could be read: it is empty, cut short, or in another format than its ending says")
     objects: list[SceneObject] = []
     materials: list[Material] = []
+    textures: list[Texture] = []
     index: dict[str, int] = {}
     total = max(1, sum(len(getattr(geometry, "faces", ())) for geometry in graph.geometry.values()))
     for name, geometry in graph.geometry.items():
         if getattr(geometry, "faces", None) is None or len(geometry.faces) == 0:
             continue  # points and lines reflect nothing
         index[name] = len(objects)
-        mesh = Mesh(np.asarray(geometry.vertices), np.asarray(geometry.faces), len(materials))
+        material, uv = _material(geometry, textures)
+        mesh = Mesh(np.asarray(geometry.vertices), np.asarray(geometry.faces), len(materials), uv=uv)
         objects.append(SceneObject(str(name), _cut(mesh, -(-len(mesh.faces) * _PARTS // total))))
-        materials.append(_material(geometry))
+        materials.append(material)
     owner, transforms = [], []
     for node in graph.graph.nodes_geometry:
         transform, name = graph.graph[node]
@@ -227,7 +229,7 @@ def _from_graph(graph: Any) -> Scene:
             transforms.append(np.asarray(transform, dtype=np.float32)[:3])
     if not owner:
         raise SceneError("the scene is empty: it has no triangles")
-    return _lit(tuple(objects), np.array(owner, np.int32), np.array(transforms), tuple(materials), True)
+    return _lit(tuple(objects), np.array(owner, np.int32), np.array(transforms), tuple(materials), textures, True)
 
 
 def _cut(mesh: Mesh, parts: int) -> tuple[Mesh, ...]:
@@ -238,21 +240,34 @@ def _cut(mesh: Mesh, parts: int) -> tuple[Mesh, ...]:
 
 def _part(mesh: Mesh, faces: Any) -> Mesh:
     used, renumbered = np.unique(faces, return_inverse=True)
-    colors = None if mesh.colors is None else mesh.colors[used]
-    return replace(mesh, vertices=mesh.vertices[used], faces=renumbered.reshape(-1, 3).astype(np.int32), colors=colors)
+    colors, uv = (None if column is None else column[used] for column in (mesh.colors, mesh.uv))
+    corners = renumbered.reshape(-1, 3).astype(np.int32)
+    return replace(mesh, vertices=mesh.vertices[used], faces=corners, colors=colors, uv=uv)
 
 
-def _material(geometry: Any) -> Material:
-    color = getattr(getattr(geometry.visual, "material", None), "main_color", None)
-    if color is None:
-        return Material((0.72, 0.68, 0.62))
-    red, green, blue = (float(c) / 255.0 for c in color[:3])
-    return Material((red**_GAMMA, green**_GAMMA, blue**_GAMMA))
+def _material(geometry: Any, textures: list[Texture]) -> tuple[Material, Any]:
+    """Return a geometry's material and its texture coordinates, None for none; its image is added to the textures.
+
+    The base color of glTF is a reflectance, by which its image is multiplied; OBJ's is meant for a display, and an
+    image takes its place.
+    """
+    material, uv = getattr(geometry.visual, "material", None), getattr(geometry.visual, "uv", None)
+    image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    color = getattr(material, "main_color", None)
+    if image is None or uv is None:
+        if color is None:
+            return Material((0.72, 0.68, 0.62)), None
+        red, green, blue = (float(c) / 255.0 for c in color[:3])
+        return Material((red**GAMMA, green**GAMMA, blue**GAMMA)), None
+    textures.append(Texture(np.asarray(image.convert("RGB"))))
+    factor = getattr(material, "baseColorFactor", None)
+    red, green, blue = (1.0, 1.0, 1.0) if factor is None else (float(c) / 255.0 for c in factor[:3])
+    return Material((red, green, blue), texture=len(textures) - 1), np.asarray(uv)
 
 
-def _lit(objects: Any, owner: Any, transforms: Any, materials: Any, y_up: bool) -> Scene:
+def _lit(objects: Any, owner: Any, transforms: Any, materials: Any, textures: list[Texture], y_up: bool) -> Scene:
     """Add a sky, and a lamp above and beside the scene that gives its centre an irradiance of about 2."""
-    scene = Scene(objects, owner, transforms, materials)
+    scene = Scene(objects, owner, transforms, materials, textures=tuple(textures))
     low, high = (corner.astype(np.float64) for corner in scene.bounds)
     if (low == high).all():
         raise SceneError(f"the mesh has no extent: all its vertices lie at {low.tolist()}")
@@ -262,4 +277,4 @@ def _lit(objects: Any, owner: Any, transforms: Any, materials: Any, y_up: bool) 
     position = centre + 4.0 * radius * aside / np.linalg.norm(aside)
     power = 2.0 * (4.0 * radius) ** 2
     lamp = PointLight((float(position[0]), float(position[1]), float(position[2])), (power, 0.95 * power, 0.85 * power))
-    return Scene(objects, owner, transforms, materials, (lamp,), Environment(up=up))
+    return replace(scene, points=(lamp,), environment=Environment(up=up))

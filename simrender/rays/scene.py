@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,12 @@ if TYPE_CHECKING:
 
 F32 = NDArray[np.float32]
 I32 = NDArray[np.int32]
+U8 = NDArray[np.uint8]
 
 IDENTITY = np.eye(4, dtype=np.float32)[:3]
+
+GAMMA = 2.2
+"""Colors in image and mesh files are meant for a display; scenes hold reflectances, their power of this."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +44,45 @@ class Material:
         Probability that a ray is reflected mirror-like and not diffusely, 0 to 1.
     emission : (r, g, b)
         Radiance emitted on both sides; any value above zero makes the meshes of this material area lights.
+    texture : int
+        Index into the scene's textures, by whose colors the albedo is multiplied; -1 for none.
 
     """
 
     albedo: tuple[float, float, float] = (0.7, 0.7, 0.7)
     mirror: float = 0.0
     emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    texture: int = -1
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """An image on surfaces, repeated without end and read bilinearly, without levels of detail.
+
+    Attributes
+    ----------
+    texels : uint8 array (height, width, 3)
+        Colors for a display, the top row first: reflectances are their power of `GAMMA`.
+
+    Raises
+    ------
+    SceneError
+        If the array is not such an image.
+
+    """
+
+    texels: U8
+
+    def __post_init__(self) -> None:
+        texels = np.ascontiguousarray(self.texels)
+        if texels.dtype != np.uint8 or texels.ndim != 3 or texels.shape[2] != 3 or texels.size == 0:
+            raise SceneError(f"a texture is uint8 of shape (height, width, 3), got {texels.dtype} of {texels.shape}")
+        object.__setattr__(self, "texels", texels)
+
+
+def texture(reflectance: NDArray[np.floating[Any]]) -> Texture:
+    """Return the texture whose colors are reflectances from 0 to 1, shape (height, width, 3)."""
+    return Texture(np.rint(255.0 * np.clip(reflectance, 0.0, 1.0) ** (1.0 / GAMMA)).astype(np.uint8))
 
 
 @dataclass(frozen=True)
@@ -101,11 +138,14 @@ class Mesh:
         Of the vertices, 0 to 1; they take the place of the material's albedo.
     smooth : bool
         Shade with normals mixed from those of the vertices, and not with the faces' own; see `Scene.vertex_normals`.
+    uv : float32 array (n, 2), optional
+        Where the vertices lie in the material's texture, which is 1 wide and 1 high, from its lower left corner.
 
     Raises
     ------
     SceneError
-        If the mesh is empty, has a vertex that is not finite, or a face that points outside the vertices.
+        If the mesh is empty, has a vertex that is not finite, or a face that points outside the vertices, or other
+        columns than vertices.
 
     """
 
@@ -114,6 +154,7 @@ class Mesh:
     material: int = 0
     colors: F32 | None = None
     smooth: bool = False
+    uv: F32 | None = None
 
     def __post_init__(self) -> None:
         vertices = np.ascontiguousarray(self.vertices, dtype=np.float32)
@@ -136,6 +177,13 @@ class Mesh:
             if colors.shape != vertices.shape:
                 raise SceneError(f"{len(vertices)} vertices need colors of the same shape, got {colors.shape}")
             object.__setattr__(self, "colors", colors)
+        if self.uv is not None:
+            uv = np.ascontiguousarray(self.uv, dtype=np.float32)
+            if uv.shape != (len(vertices), 2):
+                raise SceneError(f"{len(vertices)} vertices need texture coordinates (n, 2), got {uv.shape}")
+            if not np.isfinite(uv).all():
+                raise SceneError("texture coordinates are not finite")
+            object.__setattr__(self, "uv", uv)
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "faces", np.ascontiguousarray(indices, dtype=np.int32))
 
@@ -192,6 +240,8 @@ class Scene:
         A structured volume; such a scene needs no instances.
     elements : Elements, optional
         An unstructured volume; such a scene needs no instances.
+    textures : tuple of Texture
+        Of the materials that have one; their meshes say where they lie in it.
 
     Raises
     ------
@@ -209,6 +259,7 @@ class Scene:
     hemispheres: tuple[tuple[float, float, float], ...] = ()
     volume: Volume | None = None
     elements: Elements | None = None
+    textures: tuple[Texture, ...] = ()
 
     def __post_init__(self) -> None:
         of = np.ascontiguousarray(self.instance_object, dtype=np.int32)
@@ -227,6 +278,11 @@ class Scene:
             for mesh in thing.meshes:
                 if not 0 <= mesh.material < len(self.materials):
                     raise SceneError(f"object {thing.name!r} uses material {mesh.material} of {len(self.materials)}")
+                if self.materials[mesh.material].texture >= 0 and mesh.uv is None:
+                    raise SceneError(f"object {thing.name!r} has a texture, but no texture coordinates")
+        for material in self.materials:
+            if material.texture >= len(self.textures):
+                raise SceneError(f"a material uses texture {material.texture} of {len(self.textures)}")
         object.__setattr__(self, "instance_object", of)
         object.__setattr__(self, "instance_transform", transform)
 
@@ -319,6 +375,19 @@ class Scene:
         ]
         return np.concatenate([of_object[index] for index in self.instance_object])
 
+    def vertex_uv(self) -> F32:
+        """Return the texture coordinates of each vertex of `triangles`, float32 (v, 2); 0 where the mesh has none.
+
+        The array has no rows if no mesh has such.
+        """
+        if all(mesh.uv is None for mesh in self.meshes):
+            return np.zeros((0, 2), np.float32)
+        of_object = [
+            np.concatenate([np.zeros((len(m.vertices), 2), np.float32) if m.uv is None else m.uv for m in thing.meshes])
+            for thing in self.objects
+        ]
+        return np.concatenate([of_object[index] for index in self.instance_object])
+
     @cached_property
     def bounds(self) -> tuple[F32, F32]:
         """Lowest and highest corner of a box around everything; instances are not written out for it."""
@@ -368,11 +437,15 @@ class Scene:
                 digest.update(mesh.faces.data)
                 if mesh.smooth:
                     digest.update(b"smooth")
-                if mesh.colors is not None:
-                    digest.update(mesh.colors.data)
+                for column in (mesh.colors, mesh.uv):
+                    if column is not None:
+                        digest.update(column.data)
         digest.update(self.instance_object.data)
         digest.update(self.instance_transform.data)
         digest.update(repr((self.materials, self.points, self.environment, self.hemispheres)).encode())
+        for image in self.textures:
+            digest.update(f"texture {image.texels.shape}".encode())
+            digest.update(image.texels.data)
         for volume in (self.volume, self.elements):
             if volume is not None:
                 digest.update(volume.key.encode())

@@ -8,7 +8,8 @@ limit or by Russian roulette on its throughput. A ray has at most two children, 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from simrender.rays.integrators import PathTracing
 from simrender.rays.kinds import DIFFUSE, MIRROR, SHADOW
 from simrender.rays.sampling import cosine_direction, offset_origin, path_key, uniform
-from simrender.rays.scene import Environment, Scene
+from simrender.rays.scene import GAMMA, Environment, Scene, Texture
 
 if TYPE_CHECKING:
     from simrender.rays.embree import Hits
@@ -31,6 +32,49 @@ _JITTER = 0
 _FACING = 0.7
 """Share of a surface's brightness under a headlight that depends on the angle at which it is seen."""
 
+_REFLECTANCE = (np.arange(256) / 255.0) ** GAMMA
+
+
+class Looks(NamedTuple):
+    """What kernels need to know of a scene's surfaces.
+
+    Attributes
+    ----------
+    vertices : float32 array (v, 3)
+    faces : int32 array (t, 3)
+    normals : float32 array (v, 3) or (0, 3)
+    colors : float32 array (v, 3) or (0, 3)
+        Negative where the vertex has none.
+    uv : float32 array (v, 2) or (0, 2)
+    material : int32 array (t,)
+        Row of each triangle in ``materials``.
+    materials : float64 array (m, 8)
+        Albedo, mirror, emission, texture.
+    texels : uint8 array (n, 3)
+        Of all textures, one after the other.
+    textures : int64 array (k, 3)
+        First row, width and height of each.
+
+    """
+
+    vertices: F32
+    faces: NDArray[np.int32]
+    normals: F32
+    colors: F32
+    uv: F32
+    material: NDArray[np.int32]
+    materials: NDArray[np.float64]
+    texels: NDArray[np.uint8]
+    textures: NDArray[np.int64]
+
+
+def _texels(textures: Sequence[Texture]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Return all texels in one array, and where each texture lies in it."""
+    sizes = np.array([image.texels.shape[:2] for image in textures], np.int64).reshape(-1, 2)
+    first = np.cumsum(sizes.prod(axis=1)) - sizes.prod(axis=1)
+    texels = np.concatenate([np.zeros((0, 3), np.uint8), *(image.texels.reshape(-1, 3) for image in textures)])
+    return texels, np.column_stack([first, sizes[:, ::-1]])
+
 
 class Surfaces:
     """A scene's materials and lights as flat arrays, for the kernel.
@@ -43,16 +87,17 @@ class Surfaces:
 
     def __init__(self, scene: Scene) -> None:
         triangles = scene.triangles
-        self.vertices, self.faces = triangles.vertices, triangles.faces
-        self.normals, self.colors = scene.vertex_normals(), scene.vertex_colors()
-        self.material = scene.mesh_material[triangles.mesh]
-        rows = [(*m.albedo, m.mirror, *m.emission) for m in scene.materials]
-        self.materials = np.array(rows, dtype=np.float64).reshape(-1, 7)
+        rows = [(*m.albedo, m.mirror, *m.emission, m.texture) for m in scene.materials]
+        self.looks = Looks(
+            triangles.vertices, triangles.faces, scene.vertex_normals(), scene.vertex_colors(), scene.vertex_uv(),
+            scene.mesh_material[triangles.mesh], np.array(rows, dtype=np.float64).reshape(-1, 8),
+            *_texels(scene.textures),
+        )  # fmt: skip
         self.sky = sky_row(scene.environment)
         points = [(*p.position, *p.intensity, float(p.falloff)) for p in scene.points]
         self.points = np.array(points, np.float64).reshape(-1, 7)
         self.hemispheres = np.array(scene.hemispheres, np.float64).reshape(-1, 3)
-        emits = np.any(self.materials[:, 4:] > 0, axis=1)
+        emits = np.any(self.looks.materials[:, 4:7] > 0, axis=1)
         self.light_first, self.light_rows = self._area_lights(np.flatnonzero(emits[scene.mesh_material]), scene)
 
     def _area_lights(self, meshes: NDArray[np.int64], scene: Scene) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -63,11 +108,11 @@ class Surfaces:
         """
         first, rows = [0], [np.zeros((0, 16))]
         for mesh in meshes:
-            corners = self.vertices[self.faces[scene.triangles.mesh == mesh]].astype(np.float64)
+            corners = self.looks.vertices[self.looks.faces[scene.triangles.mesh == mesh]].astype(np.float64)
             a, e, f = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
             normal = np.cross(e, f)
             size = np.linalg.norm(normal, axis=1)
-            emission = np.tile(self.materials[scene.mesh_material[mesh], 4:], (len(a), 1))
+            emission = np.tile(self.looks.materials[scene.mesh_material[mesh], 4:7], (len(a), 1))
             solid = size > 0
             table = np.column_stack(
                 [a, e, f, normal / np.where(solid, size, 1.0)[:, None], emission, np.cumsum(0.5 * size)]
@@ -76,6 +121,14 @@ class Surfaces:
                 rows.append(table[solid])
                 first.append(first[-1] + int(solid.sum()))
         return np.array(first), np.concatenate(rows)
+
+
+_NO_LOOKS = Looks(
+    *(np.zeros(shape, kind) for shape, kind in (
+        ((0, 3), np.float32), ((0, 3), np.int32), ((0, 3), np.float32), ((0, 3), np.float32), ((0, 2), np.float32),
+        ((0,), np.int32), ((0, 8), np.float64), ((0, 3), np.uint8), ((0, 3), np.int64),
+    ))
+)  # fmt: skip
 
 
 def sky_row(sky: Environment) -> NDArray[np.float64]:
@@ -153,8 +206,7 @@ def shade(rays: dict[str, Any], hits: Any, surfaces: Surfaces, path: PathTracing
     spawned = _shade(
         rays["direction"], rays["throughput"], rays["pixel"], rays["sample"], rays["kind"], rays["diffuse"],
         rays["mirror"], hits.primitive, hits.u, hits.v,
-        surfaces.vertices, surfaces.faces, surfaces.normals, surfaces.colors, surfaces.material, surfaces.materials,
-        surfaces.sky, surfaces.points, surfaces.light_first, surfaces.light_rows,
+        surfaces.looks, surfaces.sky, surfaces.points, surfaces.light_first, surfaces.light_rows,
         path.diffuse, path.mirror, path.roulette, np.uint64(seed),
         radiance, children, out["origin"], out["origin"].view(np.int32), out["direction"], out["throughput"],
         out["reach"], out["parent"], out["kind"],
@@ -180,12 +232,32 @@ def sky_color(sky, dx, dy, dz, channel):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def surface_point(primitive, u, v, dx, dy, dz, vertices, faces, normals, colors, material_of, materials):  # type: ignore[no-untyped-def]
+def texture_color(looks, texture, x, y):  # type: ignore[no-untyped-def]
+    """Return the reflectance of a texture at a point, between the middles of four texels."""
+    first, width, height = looks.textures[texture, 0], looks.textures[texture, 1], looks.textures[texture, 2]
+    x, y = x * width - 0.5, (1.0 - y) * height - 0.5
+    left, top = math.floor(x), math.floor(y)
+    x, y = x - left, y - top
+    red = green = blue = 0.0
+    for down in range(2):
+        row = first + (np.int64(top) + down) % height * width
+        for right in range(2):
+            texel = row + (np.int64(left) + right) % width
+            weight = (x if right else 1.0 - x) * (y if down else 1.0 - y)
+            red += weight * _REFLECTANCE[looks.texels[texel, 0]]
+            green += weight * _REFLECTANCE[looks.texels[texel, 1]]
+            blue += weight * _REFLECTANCE[looks.texels[texel, 2]]
+    return red, green, blue
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def surface_point(primitive, u, v, dx, dy, dz, looks):  # type: ignore[no-untyped-def]
     """Return a hit's point, the face's unit normal, the shading normal (both towards the viewer) and the albedo.
 
     The point comes from the triangle's corners: exact to an ulp however far the ray came (Waechter and Binder). The
     face normal of a degenerate triangle is zero.
     """
+    vertices, faces, normals, colors = looks.vertices, looks.faces, looks.normals, looks.colors
     a, b, c = faces[primitive, 0], faces[primitive, 1], faces[primitive, 2]
     # Numba's float() leaves a float32 what it is.
     ax, ay, az = np.float64(vertices[a, 0]), np.float64(vertices[a, 1]), np.float64(vertices[a, 2])
@@ -194,8 +266,8 @@ def surface_point(primitive, u, v, dx, dy, dz, vertices, faces, normals, colors,
     px, py, pz = ax + u * ex + v * fx, ay + u * ey + v * fy, az + u * ez + v * fz
     gx, gy, gz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
     length = math.sqrt(gx * gx + gy * gy + gz * gz)
-    m = material_of[primitive]
-    ar, ag, ab = materials[m, 0], materials[m, 1], materials[m, 2]
+    m = looks.material[primitive]
+    ar, ag, ab = looks.materials[m, 0], looks.materials[m, 1], looks.materials[m, 2]
     if length == 0.0:
         return px, py, pz, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, ar, ag, ab
     length = -length if gx * dx + gy * dy + gz * dz > 0.0 else length
@@ -214,6 +286,12 @@ def surface_point(primitive, u, v, dx, dy, dz, vertices, faces, normals, colors,
         ar = w * colors[a, 0] + u * colors[b, 0] + v * colors[c, 0]
         ag = w * colors[a, 1] + u * colors[b, 1] + v * colors[c, 1]
         ab = w * colors[a, 2] + u * colors[b, 2] + v * colors[c, 2]
+    texture = np.int64(looks.materials[m, 7])
+    if texture >= 0:
+        x = w * looks.uv[a, 0] + u * looks.uv[b, 0] + v * looks.uv[c, 0]
+        y = w * looks.uv[a, 1] + u * looks.uv[b, 1] + v * looks.uv[c, 1]
+        tr, tg, tb = texture_color(looks, texture, x, y)
+        ar, ag, ab = ar * tr, ag * tg, ab * tb
     return px, py, pz, gx, gy, gz, nx, ny, nz, ar, ag, ab
 
 
@@ -221,34 +299,22 @@ def headlight(directions: F32, sky: Environment, hits: Hits | None, surfaces: Su
     """Return what rays see, float32 (n, 3): triangles lit from the viewer, else the sky."""
     seen = np.zeros((len(directions), 3), np.float32)
     if hits is None or surfaces is None:
-        none, no_ids = np.zeros((0, 3), np.float32), np.full(len(directions), -1, np.int32)
-        flat = np.zeros(len(directions), np.float32)
-        _headlight(
-            directions, sky_row(sky), no_ids, flat, flat, none, np.zeros((0, 3), np.int32), none, none,
-            np.zeros(0, np.int32), np.zeros((0, 7)), seen,
-        )  # fmt: skip
+        nothing, flat = np.full(len(directions), -1, np.int32), np.zeros(len(directions), np.float32)
+        _headlight(directions, sky_row(sky), nothing, flat, flat, _NO_LOOKS, seen)
     else:
-        _headlight(
-            directions, sky_row(sky), hits.primitive, hits.u, hits.v, surfaces.vertices, surfaces.faces,
-            surfaces.normals, surfaces.colors, surfaces.material, surfaces.materials, seen,
-        )  # fmt: skip
+        _headlight(directions, sky_row(sky), hits.primitive, hits.u, hits.v, surfaces.looks, seen)
     return seen
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _headlight(  # type: ignore[no-untyped-def]
-    direction, sky, primitive, u, v, vertices, faces, normals, colors, material_of, materials, seen
-):
+def _headlight(direction, sky, primitive, u, v, looks, seen):  # type: ignore[no-untyped-def]
     for i in range(len(direction)):
         dx, dy, dz = np.float64(direction[i, 0]), np.float64(direction[i, 1]), np.float64(direction[i, 2])
         if primitive[i] < 0:
             for c in range(3):
                 seen[i, c] = sky_color(sky, dx, dy, dz, c)
             continue
-        point = surface_point(
-            primitive[i], np.float64(u[i]), np.float64(v[i]), dx, dy, dz,
-            vertices, faces, normals, colors, material_of, materials,
-        )  # fmt: skip
+        point = surface_point(primitive[i], np.float64(u[i]), np.float64(v[i]), dx, dy, dz, looks)
         facing = abs(dx * point[6] + dy * point[7] + dz * point[8])
         for c in range(3):
             seen[i, c] = point[9 + c] * (1.0 - _FACING + _FACING * facing)
@@ -257,7 +323,7 @@ def _headlight(  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy")
 def _shade(  # type: ignore[no-untyped-def]
     direction, throughput, pixel, sample, kind, diffuse_bounces, mirror_bounces, primitive, u, v,
-    vertices, faces, normals, colors, material_of, materials, sky, points, light_first, light_rows,
+    looks, sky, points, light_first, light_rows,
     most_diffuse, most_mirror, roulette, seed,
     radiance, children, out_origin, out_bits, out_direction, out_throughput, out_reach, out_parent, out_kind,
 ):  # fmt: skip
@@ -277,29 +343,18 @@ def _shade(  # type: ignore[no-untyped-def]
             continue
 
         px, py, pz, gx, gy, gz, nx, ny, nz, ar, ag, ab = surface_point(
-            primitive[i],
-            np.float64(u[i]),
-            np.float64(v[i]),
-            dx,
-            dy,
-            dz,
-            vertices,
-            faces,
-            normals,
-            colors,
-            material_of,
-            materials,
+            primitive[i], np.float64(u[i]), np.float64(v[i]), dx, dy, dz, looks
         )
         if gx == 0.0 and gy == 0.0 and gz == 0.0:
             continue  # a degenerate triangle has no side to scatter to
 
-        m = material_of[primitive[i]]
+        m = looks.material[primitive[i]]
         if kind[i] != DIFFUSE:  # light that reached a diffuse bounce directly was counted by its shadow ray
             for c in range(3):
-                radiance[i, c] = throughput[i, c] * materials[m, 4 + c]
+                radiance[i, c] = throughput[i, c] * looks.materials[m, 4 + c]
 
         key = path_key(seed, pixel[i], sample[i], 1 + diffuse_bounces[i] + mirror_bounces[i])
-        is_mirror = uniform(key, _LOBE) < materials[m, 3]
+        is_mirror = uniform(key, _LOBE) < looks.materials[m, 3]
         if (is_mirror and mirror_bounces[i] >= most_mirror) or (not is_mirror and diffuse_bounces[i] >= most_diffuse):
             continue
         tr, tg, tb = throughput[i, 0] * ar, throughput[i, 1] * ag, throughput[i, 2] * ab

@@ -110,9 +110,8 @@ def scatter(
     if hits is not None and surfaces is not None:
         on = np.flatnonzero(event == _TRIANGLE)
         _on_triangles(
-            on, rays["direction"], hits.primitive, hits.u, hits.v, surfaces.vertices, surfaces.faces, surfaces.normals,
-            surfaces.colors, surfaces.material, surfaces.materials, point, normal, albedo, emitted,
-        )  # fmt: skip
+            on, rays["direction"], hits.primitive, hits.u, hits.v, surfaces.looks, point, normal, albedo, emitted
+        )
 
     points = [(*p.position, *p.intensity, float(p.falloff)) for p in scene.points]
     out: Columns = {
@@ -147,21 +146,17 @@ def scatter(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _on_triangles(  # type: ignore[no-untyped-def]
-    rows, direction, primitive, u, v, vertices, faces, normals, colors, material_of, materials,
-    point, normal, albedo, emitted,
-):  # fmt: skip
+    rows, direction, primitive, u, v, looks, point, normal, albedo, emitted
+):
     for i in rows:
         dx, dy, dz = np.float64(direction[i, 0]), np.float64(direction[i, 1]), np.float64(direction[i, 2])
-        at = surface_point(
-            primitive[i], np.float64(u[i]), np.float64(v[i]), dx, dy, dz,
-            vertices, faces, normals, colors, material_of, materials,
-        )  # fmt: skip
-        m = material_of[primitive[i]]
+        at = surface_point(primitive[i], np.float64(u[i]), np.float64(v[i]), dx, dy, dz, looks)
+        m = looks.material[primitive[i]]
         point[i, 0], point[i, 1], point[i, 2] = at[0], at[1], at[2]
         normal[i, 0], normal[i, 1], normal[i, 2] = at[3], at[4], at[5]
         albedo[i, 0], albedo[i, 1], albedo[i, 2] = at[9], at[10], at[11]
         for c in range(3):
-            emitted[i, c] = materials[m, 4 + c]
+            emitted[i, c] = looks.materials[m, 4 + c]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

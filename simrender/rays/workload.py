@@ -106,6 +106,7 @@ class Workload:
             own_bytes += scene.volume.voxels.nbytes
         if (elements := scene.elements) is not None:
             own_bytes += sum(a.nbytes for a in (elements.points, elements.scalars, elements.corners, elements.kind))
+        own_texels = sum(image.texels.nbytes for image in scene.textures)
         unique = card.triangles or scene.unique_triangles
         instanced = unique * scene.instanced_triangles / max(1, scene.unique_triangles)
         return Published(
@@ -113,7 +114,7 @@ class Workload:
             instances=card.growth * (card.instances or len(scene.instance_object)),
             instanced_triangles=card.growth**2 * (card.instanced_triangles or instanced),
             geometry_bytes=card.growth * (own_bytes if card.geometry_bytes is None else card.geometry_bytes),
-            texture_bytes=card.growth * (card.texture_bytes or 0.0),
+            texture_bytes=card.growth * (own_texels if card.texture_bytes is None else card.texture_bytes),
         )
 
     @property

@@ -158,13 +158,14 @@ def test_statues_are_dense_and_closed():
     assert volume((stone.vertices.astype(np.float64), stone.faces)) > 0.05  # faces look outwards
 
 
-def test_paintings_are_painted(hall):
-    canvases = [
-        m.colors for thing in hall.objects if "painting" in thing.name for m in thing.meshes if m.colors is not None
-    ]
-    assert len(canvases) >= 20
-    assert all(c.min() >= 0.0 and c.max() <= 1.0 for c in canvases)
-    assert np.mean([c.std(axis=0).max() for c in canvases]) > 0.05
+def test_paintings_are_painted_and_each_has_a_texture_of_its_own(hall):
+    canvases = [thing.meshes[0] for thing in hall.objects if thing.name.startswith("painting")]
+    pictures = [hall.textures[hall.materials[canvas.material].texture].texels for canvas in canvases]
+    assert len({id(picture) for picture in pictures}) == len(canvases) == 24
+    assert np.mean([picture.std(axis=(0, 1)).max() for picture in pictures]) > 25.0
+    for canvas in canvases:
+        assert (canvas.uv.min(axis=0).tolist(), canvas.uv.max(axis=0).tolist()) == ([0.0, 0.0], [1.0, 1.0])
+    assert len(hall.textures) == 24 + 2  # and those of the floor and of the walls
 
 
 # -- the airliner -----------------------------------------------------------------------------------------------------

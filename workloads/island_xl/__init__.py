@@ -62,12 +62,13 @@ def subdivided(mesh: Mesh, levels: int) -> Mesh:
         a, b, c = faces.T
         p, q, r = (edge.reshape(-1, 3) + count).T
         fours = np.stack([a, r, q, r, b, p, q, p, c, p, q, r], axis=1).reshape(-1, 3)
-        colors = mesh.colors
+        colors, uv = mesh.colors, mesh.uv
         mesh = replace(
             mesh,
             vertices=np.concatenate([mesh.vertices, middle.astype(np.float32)]),
             faces=fours.astype(np.int32),
             colors=None if colors is None else _between(colors, ends),
+            uv=None if uv is None else _between(uv, ends),
         )
     return mesh
 

@@ -3,19 +3,22 @@
 The original (ray queue cycling paper, figure 3 and acknowledgments) is an interior with scanned statues, paintings and
 a natural history model, put together in Blender. This one has the same make-up at a size that a laptop traces in
 seconds: a closed shell, in which no ray gets away and paths end only by absorption, dense statues, many instances, a
-polished floor, and area lights in the vault and at the far ends. Paintings, which are textures in the original, carry
-vertex colors here, so the surfaces look as varied to a ray.
+polished floor, area lights in the vault and at the far ends, and textures: each painting has its own, and so have the
+marble of the floor and the walls' damask. They are computed, as everything here is.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from simrender.rays.scene import Environment, Scene
+from simrender.rays.scene import Environment, Material, Scene, Texture
 from workloads.cad import Z, boxes, cushion, part, points, shifted, upright, whole
-from workloads.museum.hall import AISLE, ARCADE, BAY, BAYS, COLUMNS, INDEX, PALETTE, hall
+from workloads.museum.hall import AISLE, ARCADE, BAY, BAYS, COLUMNS, INDEX, PALETTE, cladding, hall
 from workloads.rooms import ammonite, barrier, bench, bust, case, crystals, figure, painting, pedestal, skeleton, vase
 from workloads.terrain import F64, Placed, generator, instances
+
+TEXELS = 128.0
+"""Of a painting, a metre."""
 
 SIDES = np.array([[-1.0], [1.0]])
 
@@ -27,7 +30,8 @@ def museum(*, seed: int = 1, detail: float = 1.0) -> Scene:
     ----------
     seed : int
     detail : float
-        Factor on the triangles of every exhibit and of every column; the hall and the number of things in it stay.
+        Factor on the triangles of every exhibit and of every column, and on the texels of every painting; the hall and
+        the number of things in it stay.
 
     Returns
     -------
@@ -36,10 +40,14 @@ def museum(*, seed: int = 1, detail: float = 1.0) -> Scene:
         positive y, and meant to be seen from (3.1, 3.6, 2.3).
 
     """
-    placed = [*hall(detail), *_sculpture(seed, detail), *_pictures(seed, detail), *_middle(seed, detail)]
+    pictures, canvases = _pictures(seed, detail)
+    placed = [*hall(detail), *_sculpture(seed, detail), *pictures, *_middle(seed, detail)]
     things, instance_object, instance_transform = instances(placed)
     night = Environment(zenith=(0.0, 0.0, 0.0), horizon=(0.0, 0.0, 0.0), ground=(0.0, 0.0, 0.0))
-    return Scene(things, instance_object, instance_transform, tuple(PALETTE.values()), (), night)
+    textures = (*cladding(seed), *canvases)
+    first = len(textures) - len(canvases)
+    materials = [*PALETTE.values(), *(Material((1.0, 1.0, 1.0), texture=first + k) for k in range(len(canvases)))]
+    return Scene(things, instance_object, instance_transform, tuple(materials), (), night, textures=textures)
 
 
 def _sculpture(seed: int, detail: float) -> list[Placed]:
@@ -64,10 +72,14 @@ def _sculpture(seed: int, detail: float) -> list[Placed]:
     return placed
 
 
-def _pictures(seed: int, detail: float) -> list[Placed]:
-    """Return paintings on the walls of the aisles: a large one, or two small ones above each other, in every bay."""
+def _pictures(seed: int, detail: float) -> tuple[list[Placed], list[Texture]]:
+    """Return paintings on the walls of the aisles: a large one, or two small ones above each other, in every bay.
+
+    The material of the k-th canvas comes k places after the last of the palette, and its texture is the k-th.
+    """
     rng = generator(seed, "hanging")
     placed: list[Placed] = []
+    textures: list[Texture] = []
     for name, side in (("left", -1.0), ("right", 1.0)):
         for bay in range(1, BAYS):
             large = (bay + (side > 0)) % 2 == 0
@@ -75,17 +87,19 @@ def _pictures(seed: int, detail: float) -> list[Placed]:
             high = (rng.uniform(1.3, 2.2), rng.uniform(1.2, 1.6), 5.1)
             sizes = [(rng.uniform(3.0, 3.9), rng.uniform(2.2, 2.8), 3.6)] if large else [low, high]
             for k, (width, height, z) in enumerate(sizes):
-                thing = painting(
+                thing, picture = painting(
                     seed,
                     f"painting {name} {bay} {k}",
                     triangles=round((9000 if large else 5000) * detail),
+                    texels=TEXELS * detail**0.5,
                     width=width,
                     height=height,
-                    canvas=INDEX["canvas"],
+                    canvas=len(PALETTE) + len(textures),
                     gilt=INDEX["gilt"],
                 )
+                textures.append(picture)
                 placed.append((thing, upright([[side * (AISLE - 0.01), BAY * bay, z]], -side * 0.5 * np.pi)))
-    return placed
+    return placed, textures
 
 
 def _middle(seed: int, detail: float) -> list[Placed]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from simrender.rays.scene import IDENTITY, Material, SceneObject
+from simrender.rays.scene import IDENTITY, Material, SceneObject, Texture, texture
 from workloads.cad import (
     Y,
     Z,
@@ -23,7 +23,7 @@ from workloads.cad import (
     upright,
     whole,
 )
-from workloads.terrain import F64, I64, Placed, grid_faces
+from workloads.terrain import F64, I64, Noise, Placed, grid_faces, smoothstep
 
 NAVE, AISLE, LENGTH = 6.5, 12.5, 54.0  # half widths, and how long the hall is
 SPRING = 8.2  # height from which the vault springs; the aisles are as high
@@ -32,22 +32,26 @@ BAYS = round(LENGTH / BAY)
 ARCADE = NAVE + 0.5  # where the columns stand
 COLUMN = 6.9  # their height
 TILE = 0.75
+REPEAT = 0.8  # of the damask on the walls
+
+ACROSS = round(2.0 * AISLE / TILE)  # tiles
 
 PALETTE = {
     "plaster": Material((0.80, 0.77, 0.70)),
     "masonry": Material((0.40, 0.34, 0.28)),
     "vault": Material((0.83, 0.80, 0.73)),
-    "wall": Material((0.36, 0.085, 0.075)),
+    "wall": Material((0.42, 0.1, 0.088), texture=1),
     "dado": Material((0.55, 0.51, 0.44)),
     "light marble": Material((0.72, 0.69, 0.63), mirror=0.16),
-    "dark marble": Material((0.16, 0.17, 0.17), mirror=0.2),
     "red marble": Material((0.40, 0.17, 0.12), mirror=0.16),
+    "light floor": Material((0.80, 0.77, 0.70), mirror=0.16, texture=0),
+    "dark floor": Material((0.18, 0.19, 0.19), mirror=0.2, texture=0),
+    "red floor": Material((0.45, 0.19, 0.135), mirror=0.16, texture=0),
     "stone": Material((0.68, 0.63, 0.54)),
     "white marble": Material((0.82, 0.80, 0.77)),
     "bronze": Material((0.30, 0.20, 0.10), mirror=0.25),
     "dark stone": Material((0.24, 0.24, 0.25), mirror=0.06),
     "gilt": Material((0.70, 0.50, 0.19), mirror=0.3),
-    "canvas": Material((0.5, 0.5, 0.5)),
     "glaze": Material((0.5, 0.3, 0.2), mirror=0.08),
     "bone": Material((0.64, 0.54, 0.40)),
     "iron": Material((0.10, 0.10, 0.11), mirror=0.15),
@@ -65,6 +69,7 @@ PALETTE = {
     "aisle lamp": Material((0.8, 0.8, 0.8), emission=(4.6, 4.0, 3.1)),
 }
 INDEX = {name: index for index, name in enumerate(PALETTE)}
+FLOOR = {INDEX[name] for name in ("light floor", "dark floor", "red floor")}
 
 COLUMNS = BAY * (np.arange(BAYS) + 0.5)
 RIB = [[-0.26, -0.02], [-0.26, 0.10], [-0.16, 0.12], [-0.14, 0.28], [0.14, 0.28], [0.16, 0.12], [0.26, 0.10],
@@ -92,7 +97,7 @@ def hall(detail: float) -> list[Placed]:
 
 def _outline() -> tuple[F64, list[str]]:
     """Return the cross-section of the hall (n, 2), around from the left end of the floor, and what each side is."""
-    floor = np.linspace(-AISLE, AISLE, round(2.0 * AISLE / TILE) + 1)
+    floor = np.linspace(-AISLE, AISLE, ACROSS + 1)
     wall = np.concatenate([np.linspace(0.0, 1.15, 3), np.linspace(1.15, SPRING, 6)[1:]])
     arc = np.pi * np.arange(33) / 32
     ceiling = np.array([[AISLE, SPRING], [0.5 * (AISLE + NAVE), SPRING], [NAVE, SPRING]])
@@ -123,7 +128,34 @@ def _shell() -> SceneObject:
     material = np.concatenate([_cladding(outline, kind, y), np.full(2 * n, INDEX["plaster"])])
     faces = np.concatenate([faces, near, far])
     kinds = np.flatnonzero(np.bincount(material))
-    return SceneObject("hall", tuple(mesh(clean((vertices, faces[material == m])), int(m)) for m in kinds))
+    pieces = [(int(m), clean((vertices, faces[material == m]))) for m in kinds]
+    return SceneObject("hall", tuple(mesh(piece, m, uv=_unfolded(piece[0], m)) for m, piece in pieces))
+
+
+def _unfolded(vertices: F64, material: int) -> F64 | None:
+    """Return where the points of a floor or wall lie in its texture."""
+    x, y, z = vertices.T
+    if material == INDEX["wall"]:
+        return np.stack([y, z], axis=1) / REPEAT
+    if material in FLOOR:
+        return np.stack([(x + AISLE) / (8.0 * AISLE / ACROSS), y / (4.0 * TILE)], axis=1)
+    return None
+
+
+def cladding(seed: int) -> list[Texture]:
+    """Return the textures of the hall: veined marble, a slab as wide as four tiles, and a repeat of damask."""
+    u, v = np.meshgrid((np.arange(384) + 0.5) / 384, (np.arange(384) + 0.5) / 384)
+    noise = Noise(seed, "marble")
+    bent = 6.0 * u + 3.0 * v + 1.6 * noise(u, v, 0.5, 6)
+    veins = np.exp(-12.0 * np.abs(np.sin(2.0 * bent))) + 0.5 * np.exp(-20.0 * np.abs(np.sin(5.0 * bent + u)))
+    marble = 0.92 + 0.08 * noise(u + 3.0, v, 0.3, 5) - 0.45 * veins
+    u, v = np.meshgrid((np.arange(128) + 0.5) / 128, (np.arange(128) + 0.5) / 128)
+    turn = 2.0 * np.pi
+    a, b = np.cos(turn * u), np.cos(turn * v)
+    ogee = a + b + 0.6 * np.cos(turn * (u + v)) * np.cos(turn * (u - v)) - 0.5 * a * np.cos(3.0 * turn * v)
+    damask = 0.76 + 0.2 * smoothstep(-0.1, 0.1, ogee) - 0.12 * smoothstep(1.1, 1.3, np.abs(ogee))
+    grain = 0.03 * np.cos(32.0 * turn * v)
+    return [texture(np.repeat(tone[..., None], 3, axis=2)) for tone in (marble, damask + grain)]
 
 
 def _cladding(outline: F64, kind: list[str], y: F64) -> I64:
@@ -131,12 +163,12 @@ def _cladding(outline: F64, kind: list[str], y: F64) -> I64:
     x, z = (0.5 * (outline + np.roll(outline, -1, axis=0))).T
     i, j = np.meshgrid(np.arange(len(outline)), np.arange(len(y) - 1), indexing="ij")
     kinds = np.array(kind)
-    plain = {"ceiling": "plaster", "vault": "vault", "wall": "wall", "floor": "light marble"}
+    plain = {"ceiling": "plaster", "vault": "vault", "wall": "wall", "floor": "light floor"}
     material = np.array([INDEX[plain[name]] for name in kind])
     material[(kinds == "wall") & (z < 1.15)] = INDEX["dado"]
-    floor = np.where((i + j) % 2 == 0, INDEX["light marble"], INDEX["dark marble"])
+    floor = np.where((i + j) % 2 == 0, INDEX["light floor"], INDEX["dark floor"])
     border = (np.abs(np.abs(x) - 5.2) < 0.5 * TILE) | (np.abs(np.abs(x) - 11.6) < 0.5 * TILE)
-    floor = np.where(border[:, None] | (j % 24 == 11), INDEX["red marble"], floor)
+    floor = np.where(border[:, None] | (j % 24 == 11), INDEX["red floor"], floor)
     return np.repeat(np.where((kinds == "floor")[:, None], floor, material[:, None]).ravel(), 2)
 
 

@@ -1,0 +1,112 @@
+"""Textures: which color a surface takes from which image, and how they come out of mesh files."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from simrender import load_workload
+from simrender.errors import SceneError
+from simrender.rays.integrators import RayCasting
+from simrender.rays.meshes import read_scene
+from simrender.rays.scene import GAMMA, IDENTITY, Environment, Material, Mesh, Scene, SceneObject, Texture, texture
+from simrender.rays.store import NoStore
+from simrender.rays.trace import Trace
+
+CORNERS = np.float32([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+SQUARE = np.int32([[0, 1, 2], [0, 2, 3]])
+BLACK = Environment(zenith=(0.0, 0.0, 0.0), horizon=(0.0, 0.0, 0.0), ground=(0.0, 0.0, 0.0))
+TEXELS = np.uint8([[[255, 0, 0], [0, 255, 0]], [[0, 0, 255], [255, 255, 255]]])
+"""Red and green above blue and white."""
+
+
+def square(image, uv=CORNERS[:, :2], albedo=(1.0, 1.0, 1.0)):
+    """A unit square with an image on it."""
+    mesh = Mesh(CORNERS, SQUARE, uv=uv)
+    materials = (Material(albedo, texture=0),)
+    return Scene(
+        (SceneObject("square", (mesh,)),), np.zeros(1, np.int32), IDENTITY[None], materials, (), BLACK, (),
+        textures=(Texture(image),),
+    )  # fmt: skip
+
+
+def seen(scene, across, *, half=0.5):
+    """What a camera above the square's middle sees, lit from where it is."""
+    camera = np.array([[0.5, 0.5, 100.0], [0.0, 0.0, -1.0], [half / 100, 0.0, 0.0], [0.0, half / 100, 0.0]])
+    trace = Trace(scene, camera, (across, across), 1, RayCasting(), jitter=False)
+    trace.store = NoStore()
+    trace.complete()
+    return trace.image()
+
+
+def test_the_middle_of_a_texel_has_its_color_and_the_first_row_is_on_top():
+    image = seen(square(TEXELS), 4)  # rays go through the lower left corners of pixels: here, the middles of texels
+    assert image[2, 1] == pytest.approx([0.0, 0.0, 1.0], abs=2e-3)
+    assert image[0, 1] == pytest.approx([1.0, 0.0, 0.0], abs=2e-3)
+    assert image[0, 3] == pytest.approx([0.0, 1.0, 0.0], abs=2e-3)
+    assert image[2, 3] == pytest.approx([1.0, 1.0, 1.0], abs=2e-3)
+
+
+def test_between_texels_their_reflectances_are_mixed():
+    image = seen(square(TEXELS), 4)
+    assert image[2, 2] == pytest.approx([0.5, 0.5, 1.0], abs=2e-3)  # between blue and white
+    assert image[1, 2] == pytest.approx([0.5, 0.5, 0.5], abs=2e-3)  # in the middle of all four
+    grey = square(np.full((1, 1, 3), 128, np.uint8))
+    assert seen(grey, 3) == pytest.approx((128 / 255) ** GAMMA, abs=2e-3)
+
+
+def test_an_image_is_repeated_and_multiplied_by_the_albedo():
+    twice = seen(square(TEXELS, uv=2.0 * CORNERS[:, :2] - 1.0, albedo=(0.5, 1.0, 0.25)), 8)
+    once = seen(square(TEXELS), 4)
+    assert twice[:4, :4] == pytest.approx(once * np.float32([0.5, 1.0, 0.25]), abs=2e-3)
+    assert twice[4:, 4:] == pytest.approx(twice[:4, :4], abs=1e-4)
+
+
+def test_reflectances_come_back_within_half_a_step_of_a_byte():
+    tone = np.linspace(0.0, 1.0, 97).reshape(-1, 1, 1) * np.ones(3)
+    back = (texture(tone).texels / 255.0) ** GAMMA
+    assert np.abs(back - tone).max() < 0.5 * GAMMA / 255.0 + 1e-12
+
+
+@pytest.mark.parametrize("ending", ["glb", "obj"])
+def test_a_mesh_file_keeps_its_image(ending, tmp_path):
+    import trimesh
+    from PIL import Image
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial, SimpleMaterial
+
+    image = Image.fromarray(TEXELS)
+    if ending == "glb":
+        material = PBRMaterial(baseColorTexture=image, baseColorFactor=[255, 51, 255, 255])
+    else:
+        material = SimpleMaterial(image=image, diffuse=[10, 20, 30, 255])
+    visual = TextureVisuals(uv=CORNERS[:, :2], material=material)
+    made = trimesh.Trimesh(CORNERS, SQUARE, visual=visual, process=False)
+    path = tmp_path / f"square.{ending}"
+    made.export(path)
+    scene = read_scene(path)
+    assert [image.texels.tolist() for image in scene.textures] == [TEXELS.tolist()]
+    assert {scene.materials[mesh.material].texture for mesh in scene.meshes} == {0}
+    green = 0.2 if ending == "glb" else 1.0  # the image of an OBJ file takes the place of its color
+    assert scene.materials[0].albedo == pytest.approx((1.0, green, 1.0))
+    lit = seen(Scene(scene.objects, scene.instance_object, scene.instance_transform, scene.materials, (), BLACK,
+                     textures=scene.textures), 4)  # fmt: skip
+    assert lit[0, 3] == pytest.approx([0.0, green, 0.0], abs=2e-3)
+    assert lit[2, 1] == pytest.approx([0.0, 0.0, 1.0], abs=2e-3)
+    assert load_workload(str(path), cache=tmp_path).published.texture_bytes == TEXELS.nbytes
+
+
+def test_what_is_no_texture_is_refused():
+    with pytest.raises(SceneError, match=r"uint8 of shape \(height, width, 3\), got float64 of \(2, 2, 3\)"):
+        Texture(np.ones((2, 2, 3)))
+    with pytest.raises(SceneError, match=r"got uint8 of \(4, 4\)"):
+        Texture(np.ones((4, 4), np.uint8))
+    with pytest.raises(SceneError, match=r"4 vertices need texture coordinates \(n, 2\), got \(3, 2\)"):
+        Mesh(CORNERS, SQUARE, uv=np.zeros((3, 2)))
+    with pytest.raises(SceneError, match="texture coordinates are not finite"):
+        Mesh(CORNERS, SQUARE, uv=np.full((4, 2), np.nan))
+    with pytest.raises(SceneError, match="object 'square' has a texture, but no texture coordinates"):
+        square(TEXELS, uv=None)
+    with pytest.raises(SceneError, match="a material uses texture 3 of 0"):
+        Scene((SceneObject("x", (Mesh(CORNERS, SQUARE),)),), np.zeros(1, np.int32), IDENTITY[None],
+              (Material(), Material(texture=3)))  # fmt: skip
