@@ -17,7 +17,7 @@ from simrender.errors import SceneError
 from simrender.rays.integrators import AmbientOcclusion, SprayPathTracing
 from simrender.rays.kinds import DIFFUSE, SHADOW
 from simrender.rays.sampling import cosine_direction, offset_origin, path_key, uniform
-from simrender.rays.shading import Surfaces, surface_point
+from simrender.rays.shading import Surfaces, light_triangle
 
 # Dimensions of the random numbers at a surface: two for the diffuse ray, then four a shadow ray.
 _DIRECTION, _SHADOWS = 0, 2
@@ -50,10 +50,12 @@ def shade(
         "kind": np.zeros(most * n, np.uint8),
     }
     radiance, children = np.zeros((n, 3), np.float32), np.zeros(n, np.uint16)
+    scattering = np.where(rays["kind"] == SHADOW, np.int32(-1), hits.primitive)
+    at = surfaces.at(rays["direction"], scattering, hits.u, hits.v)
     spawned = _light(
         rays["direction"], rays["throughput"], rays["pixel"], rays["sample"], rays["kind"],
-        rays["diffuse"], hits.primitive, hits.u, hits.v,
-        surfaces.looks, surfaces.points, surfaces.hemispheres, surfaces.light_first, surfaces.light_rows,
+        rays["diffuse"], hits.primitive, at,
+        surfaces.points, surfaces.hemispheres, surfaces.light_first, surfaces.light_rows,
         ambient, each, distance, *shine, light.bounces, np.uint64(seed), *(light.program_image or (0, 0, 0)),
         radiance, children, out["origin"], out["origin"].view(np.int32), out["direction"], out["throughput"],
         out["reach"], out["parent"], out["kind"],
@@ -114,8 +116,7 @@ def _program_direction(number, pair, nx, ny, nz):  # type: ignore[no-untyped-def
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _light(  # type: ignore[no-untyped-def]
-    direction, throughput, pixel, sample, kind, depth, primitive, u, v,
-    looks, points, hemispheres, light_first, light_rows,
+    direction, throughput, pixel, sample, kind, depth, primitive, at, points, hemispheres, light_first, light_rows,
     ambient, each, distance, specular, shininess, bounces, seed, width, height, samples,
     radiance, children, out_origin, out_bits, out_direction, out_throughput, out_reach, out_parent, out_kind,
 ):  # fmt: skip
@@ -133,15 +134,13 @@ def _light(  # type: ignore[no-untyped-def]
         if missed:
             continue
         dx, dy, dz = np.float64(direction[i, 0]), np.float64(direction[i, 1]), np.float64(direction[i, 2])
-        px, py, pz, gx, gy, gz, sx, sy, sz, ar, ag, ab = surface_point(
-            primitive[i], np.float64(u[i]), np.float64(v[i]), dx, dy, dz, looks
-        )
+        px, py, pz, gx, gy, gz = at[i, 0], at[i, 1], at[i, 2], at[i, 3], at[i, 4], at[i, 5]
+        sx, sy, sz, ar, ag, ab = at[i, 6], at[i, 7], at[i, 8], at[i, 9], at[i, 10], at[i, 11]
         if gx == 0.0 and gy == 0.0 and gz == 0.0:
             continue  # a degenerate triangle has no side to scatter to
-        m = looks.material[primitive[i]]
         if depth[i] == 0:
             for c in range(3):
-                radiance[i, c] = throughput[i, c] * looks.materials[m, 4 + c]
+                radiance[i, c] = throughput[i, c] * at[i, 13 + c]
         tr, tg, tb = np.float64(throughput[i, 0]), np.float64(throughput[i, 1]), np.float64(throughput[i, 2])
         key = path_key(seed, pixel[i], sample[i], 1 + depth[i])
         number = 0
@@ -164,15 +163,8 @@ def _light(  # type: ignore[no-untyped-def]
             else:
                 index = (ray - ambient) // each if ray - ambient < each * n_wide else -1
                 if 0 <= index < n_area:
-                    low, high = light_first[index], light_first[index + 1] - 1
-                    area = light_rows[high, 15]
-                    target = uniform(key, dimension) * area
-                    while low < high:
-                        middle = (low + high) // 2
-                        if light_rows[middle, 15] <= target:
-                            low = middle + 1
-                        else:
-                            high = middle
+                    area = light_rows[light_first[index + 1] - 1, 15]
+                    low = light_triangle(light_first, light_rows, index, uniform(key, dimension))
                     s1, s2 = math.sqrt(uniform(key, dimension + 1)), uniform(key, dimension + 2)
                     w1, w2 = s1 * (1.0 - s2), s1 * s2
                     qx = light_rows[low, 0] + w1 * light_rows[low, 3] + w2 * light_rows[low, 6]

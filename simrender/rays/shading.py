@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numba import njit
@@ -35,39 +35,6 @@ _FACING = 0.7
 _REFLECTANCE = (np.arange(256) / 255.0) ** GAMMA
 
 
-class Looks(NamedTuple):
-    """What kernels need to know of a scene's surfaces.
-
-    Attributes
-    ----------
-    vertices : float32 array (v, 3)
-    faces : int32 array (t, 3)
-    normals : float32 array (v, 3) or (0, 3)
-    colors : float32 array (v, 3) or (0, 3)
-        Negative where the vertex has none.
-    uv : float32 array (v, 2) or (0, 2)
-    material : int32 array (t,)
-        Row of each triangle in ``materials``.
-    materials : float64 array (m, 8)
-        Albedo, mirror, emission, texture.
-    texels : uint8 array (n, 3)
-        Of all textures, one after the other.
-    textures : int64 array (k, 3)
-        First row, width and height of each.
-
-    """
-
-    vertices: F32
-    faces: NDArray[np.int32]
-    normals: F32
-    colors: F32
-    uv: F32
-    material: NDArray[np.int32]
-    materials: NDArray[np.float64]
-    texels: NDArray[np.uint8]
-    textures: NDArray[np.int64]
-
-
 def _texels(textures: Sequence[Texture]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
     """Return all texels in one array, and where each texture lies in it."""
     sizes = np.array([image.texels.shape[:2] for image in textures], np.int64).reshape(-1, 2)
@@ -87,48 +54,57 @@ class Surfaces:
 
     def __init__(self, scene: Scene) -> None:
         triangles = scene.triangles
+        self.vertices, self.faces = triangles.vertices, triangles.faces
+        self.normals, self.colors, self.uv = scene.vertex_normals(), scene.vertex_colors(), scene.vertex_uv()
+        self.material = scene.mesh_material[triangles.mesh]
         rows = [(*m.albedo, m.mirror, *m.emission, m.texture) for m in scene.materials]
-        self.looks = Looks(
-            triangles.vertices, triangles.faces, scene.vertex_normals(), scene.vertex_colors(), scene.vertex_uv(),
-            scene.mesh_material[triangles.mesh], np.array(rows, dtype=np.float64).reshape(-1, 8),
-            *_texels(scene.textures),
-        )  # fmt: skip
+        self.materials = np.array(rows, dtype=np.float64).reshape(-1, 8)
+        self.texels, self.textures = _texels(scene.textures)
         self.sky = sky_row(scene.environment)
         points = [(*p.position, *p.intensity, float(p.falloff)) for p in scene.points]
         self.points = np.array(points, np.float64).reshape(-1, 7)
         self.hemispheres = np.array(scene.hemispheres, np.float64).reshape(-1, 3)
-        emits = np.any(self.looks.materials[:, 4:7] > 0, axis=1)
+        emits = np.any(self.materials[:, 4:7] > 0, axis=1)
         self.light_first, self.light_rows = self._area_lights(np.flatnonzero(emits[scene.mesh_material]), scene)
 
     def _area_lights(self, meshes: NDArray[np.int64], scene: Scene) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the first triangle of each area light, and a row a triangle.
 
         An area light is the set of all triangles of one emissive mesh, in all its instances; a point on it is chosen by
-        area. A row holds a corner, two edges, the unit normal, the emission, and the running area within the light.
+        area. A row holds a corner, two edges, the unit normal, the emission, the running area within the light, and
+        for the share of the area that begins as far down the light as this row, the first row that may lie there.
         """
-        first, rows = [0], [np.zeros((0, 16))]
+        first, rows = [0], [np.zeros((0, 17))]
         for mesh in meshes:
-            corners = self.looks.vertices[self.looks.faces[scene.triangles.mesh == mesh]].astype(np.float64)
+            corners = self.vertices[self.faces[scene.triangles.mesh == mesh]].astype(np.float64)
             a, e, f = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
             normal = np.cross(e, f)
             size = np.linalg.norm(normal, axis=1)
-            emission = np.tile(self.looks.materials[scene.mesh_material[mesh], 4:7], (len(a), 1))
+            emission = np.tile(self.materials[scene.mesh_material[mesh], 4:7], (len(a), 1))
             solid = size > 0
-            table = np.column_stack(
-                [a, e, f, normal / np.where(solid, size, 1.0)[:, None], emission, np.cumsum(0.5 * size)]
-            )
-            if solid.any():
-                rows.append(table[solid])
-                first.append(first[-1] + int(solid.sum()))
+            running, count = np.cumsum(0.5 * size)[solid], int(solid.sum())
+            if count:
+                shares = np.arange(count) / count * running[-1] * (1.0 - 1e-15)  # no rounding may begin behind its row
+                guide = first[-1] + np.searchsorted(running, shares, side="right")
+                unit = normal[solid] / size[solid, None]
+                rows.append(np.column_stack([a[solid], e[solid], f[solid], unit, emission[solid], running, guide]))
+                first.append(first[-1] + count)
         return np.array(first), np.concatenate(rows)
 
+    def at(self, direction: F32, primitive: NDArray[np.int32], u: F32, v: F32) -> NDArray[np.float64]:
+        """Return what there is where rays hit, float64 (n, 16); the rows of rays without a primitive mean nothing.
 
-_NO_LOOKS = Looks(
-    *(np.zeros(shape, kind) for shape, kind in (
-        ((0, 3), np.float32), ((0, 3), np.int32), ((0, 3), np.float32), ((0, 3), np.float32), ((0, 2), np.float32),
-        ((0,), np.int32), ((0, 8), np.float64), ((0, 3), np.uint8), ((0, 3), np.int64),
-    ))
-)  # fmt: skip
+        The columns are the point (3), the unit normals of the face and of the shading (3 and 3, both towards the
+        viewer), the albedo (3), the mirror probability and the emission (3). The point comes from the triangle's
+        corners: exact to an ulp however far the ray came (Waechter and Binder). The face normal of a degenerate
+        triangle is zero.
+        """
+        found = np.empty((len(primitive), 16))
+        _at(
+            direction, primitive, u, v, self.vertices, self.faces, self.normals, self.colors, self.uv, self.material,
+            self.materials, self.texels, self.textures, found,
+        )  # fmt: skip
+        return found
 
 
 def sky_row(sky: Environment) -> NDArray[np.float64]:
@@ -203,10 +179,11 @@ def shade(rays: dict[str, Any], hits: Any, surfaces: Surfaces, path: PathTracing
         "kind": np.zeros(2 * n, np.uint8),
     }
     radiance, children = np.zeros((n, 3), np.float32), np.zeros(n, np.uint16)
+    scattering = np.where(rays["kind"] == SHADOW, np.int32(-1), hits.primitive)
+    at = surfaces.at(rays["direction"], scattering, hits.u, hits.v)
     spawned = _shade(
         rays["direction"], rays["throughput"], rays["pixel"], rays["sample"], rays["kind"], rays["diffuse"],
-        rays["mirror"], hits.primitive, hits.u, hits.v,
-        surfaces.looks, surfaces.sky, surfaces.points, surfaces.light_first, surfaces.light_rows,
+        rays["mirror"], hits.primitive, at, surfaces.sky, surfaces.points, surfaces.light_first, surfaces.light_rows,
         path.diffuse, path.mirror, path.roulette, np.uint64(seed),
         radiance, children, out["origin"], out["origin"].view(np.int32), out["direction"], out["throughput"],
         out["reach"], out["parent"], out["kind"],
@@ -220,6 +197,17 @@ def shade(rays: dict[str, Any], hits: Any, surfaces: Surfaces, path: PathTracing
     return {"radiance": radiance, "children": children, **columns}
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def light_triangle(light_first, light_rows, light, u):  # type: ignore[no-untyped-def]
+    """Return the row of the triangle at a share u of an area light's area."""
+    first, last = light_first[light], light_first[light + 1] - 1
+    target = u * light_rows[last, 15]
+    row = np.int64(light_rows[min(first + np.int64(u * (last - first + 1)), last), 16])
+    while row < last and light_rows[row, 15] <= target:
+        row += 1
+    return row
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
 def sky_color(sky, dx, dy, dz, channel):  # type: ignore[no-untyped-def]
     """Return one channel of what a ray in a direction sees of the sky."""
@@ -231,10 +219,10 @@ def sky_color(sky, dx, dy, dz, channel):  # type: ignore[no-untyped-def]
     return sky[3 + channel] * (1.0 - blend) + sky[6 + channel] * blend
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def texture_color(looks, texture, x, y):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _texture_color(texels, textures, texture, x, y):  # type: ignore[no-untyped-def]
     """Return the reflectance of a texture at a point, between the middles of four texels."""
-    first, width, height = looks.textures[texture, 0], looks.textures[texture, 1], looks.textures[texture, 2]
+    first, width, height = textures[texture, 0], textures[texture, 1], textures[texture, 2]
     x, y = x * width - 0.5, (1.0 - y) * height - 0.5
     left, top = math.floor(x), math.floor(y)
     x, y = x - left, y - top
@@ -244,86 +232,92 @@ def texture_color(looks, texture, x, y):  # type: ignore[no-untyped-def]
         for right in range(2):
             texel = row + (np.int64(left) + right) % width
             weight = (x if right else 1.0 - x) * (y if down else 1.0 - y)
-            red += weight * _REFLECTANCE[looks.texels[texel, 0]]
-            green += weight * _REFLECTANCE[looks.texels[texel, 1]]
-            blue += weight * _REFLECTANCE[looks.texels[texel, 2]]
+            red += weight * _REFLECTANCE[texels[texel, 0]]
+            green += weight * _REFLECTANCE[texels[texel, 1]]
+            blue += weight * _REFLECTANCE[texels[texel, 2]]
     return red, green, blue
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def surface_point(primitive, u, v, dx, dy, dz, looks):  # type: ignore[no-untyped-def]
-    """Return a hit's point, the face's unit normal, the shading normal (both towards the viewer) and the albedo.
-
-    The point comes from the triangle's corners: exact to an ulp however far the ray came (Waechter and Binder). The
-    face normal of a degenerate triangle is zero.
-    """
-    vertices, faces, normals, colors = looks.vertices, looks.faces, looks.normals, looks.colors
-    a, b, c = faces[primitive, 0], faces[primitive, 1], faces[primitive, 2]
-    # Numba's float() leaves a float32 what it is.
-    ax, ay, az = np.float64(vertices[a, 0]), np.float64(vertices[a, 1]), np.float64(vertices[a, 2])
-    ex, ey, ez = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
-    fx, fy, fz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
-    px, py, pz = ax + u * ex + v * fx, ay + u * ey + v * fy, az + u * ez + v * fz
-    gx, gy, gz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
-    length = math.sqrt(gx * gx + gy * gy + gz * gz)
-    m = looks.material[primitive]
-    ar, ag, ab = looks.materials[m, 0], looks.materials[m, 1], looks.materials[m, 2]
-    if length == 0.0:
-        return px, py, pz, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, ar, ag, ab
-    length = -length if gx * dx + gy * dy + gz * dz > 0.0 else length
-    gx, gy, gz = gx / length, gy / length, gz / length
-    nx, ny, nz = gx, gy, gz
-    w = 1.0 - u - v
-    if len(normals) > 0:
-        sx = w * normals[a, 0] + u * normals[b, 0] + v * normals[c, 0]
-        sy = w * normals[a, 1] + u * normals[b, 1] + v * normals[c, 1]
-        sz = w * normals[a, 2] + u * normals[b, 2] + v * normals[c, 2]
-        length = math.sqrt(sx * sx + sy * sy + sz * sz)
+def _at(  # type: ignore[no-untyped-def]
+    direction, primitive, us, vs, vertices, faces, normals, colors, uv, material, materials, texels, textures, found
+):
+    # One kernel for all hits: an array that is passed to a function at every hit would be counted each time.
+    for i in range(len(primitive)):
+        p = primitive[i]
+        if p < 0:
+            continue
+        u, v = np.float64(us[i]), np.float64(vs[i])
+        dx, dy, dz = np.float64(direction[i, 0]), np.float64(direction[i, 1]), np.float64(direction[i, 2])
+        a, b, c = faces[p, 0], faces[p, 1], faces[p, 2]
+        # Numba's float() leaves a float32 what it is.
+        ax, ay, az = np.float64(vertices[a, 0]), np.float64(vertices[a, 1]), np.float64(vertices[a, 2])
+        ex, ey, ez = vertices[b, 0] - ax, vertices[b, 1] - ay, vertices[b, 2] - az
+        fx, fy, fz = vertices[c, 0] - ax, vertices[c, 1] - ay, vertices[c, 2] - az
+        found[i, 0], found[i, 1], found[i, 2] = ax + u * ex + v * fx, ay + u * ey + v * fy, az + u * ez + v * fz
+        gx, gy, gz = ey * fz - ez * fy, ez * fx - ex * fz, ex * fy - ey * fx
+        length = math.sqrt(gx * gx + gy * gy + gz * gz)
         if length > 0.0:
-            length = -length if sx * dx + sy * dy + sz * dz > 0.0 else length
-            nx, ny, nz = sx / length, sy / length, sz / length
-    if len(colors) > 0 and colors[a, 0] >= 0.0:
-        ar = w * colors[a, 0] + u * colors[b, 0] + v * colors[c, 0]
-        ag = w * colors[a, 1] + u * colors[b, 1] + v * colors[c, 1]
-        ab = w * colors[a, 2] + u * colors[b, 2] + v * colors[c, 2]
-    texture = np.int64(looks.materials[m, 7])
-    if texture >= 0:
-        x = w * looks.uv[a, 0] + u * looks.uv[b, 0] + v * looks.uv[c, 0]
-        y = w * looks.uv[a, 1] + u * looks.uv[b, 1] + v * looks.uv[c, 1]
-        tr, tg, tb = texture_color(looks, texture, x, y)
-        ar, ag, ab = ar * tr, ag * tg, ab * tb
-    return px, py, pz, gx, gy, gz, nx, ny, nz, ar, ag, ab
+            length = -length if gx * dx + gy * dy + gz * dz > 0.0 else length
+            gx, gy, gz = gx / length, gy / length, gz / length
+        nx, ny, nz = gx, gy, gz
+        w = 1.0 - u - v
+        if len(normals) > 0 and length != 0.0:
+            sx = w * normals[a, 0] + u * normals[b, 0] + v * normals[c, 0]
+            sy = w * normals[a, 1] + u * normals[b, 1] + v * normals[c, 1]
+            sz = w * normals[a, 2] + u * normals[b, 2] + v * normals[c, 2]
+            length = math.sqrt(sx * sx + sy * sy + sz * sz)
+            if length > 0.0:
+                length = -length if sx * dx + sy * dy + sz * dz > 0.0 else length
+                nx, ny, nz = sx / length, sy / length, sz / length
+        found[i, 3], found[i, 4], found[i, 5] = gx, gy, gz
+        found[i, 6], found[i, 7], found[i, 8] = nx, ny, nz
+        m = material[p]
+        red, green, blue = materials[m, 0], materials[m, 1], materials[m, 2]
+        if len(colors) > 0 and colors[a, 0] >= 0.0:
+            red = w * colors[a, 0] + u * colors[b, 0] + v * colors[c, 0]
+            green = w * colors[a, 1] + u * colors[b, 1] + v * colors[c, 1]
+            blue = w * colors[a, 2] + u * colors[b, 2] + v * colors[c, 2]
+        texture = np.int64(materials[m, 7])
+        if texture >= 0:
+            x = w * uv[a, 0] + u * uv[b, 0] + v * uv[c, 0]
+            y = w * uv[a, 1] + u * uv[b, 1] + v * uv[c, 1]
+            r, g, b_ = _texture_color(texels, textures, texture, x, y)
+            red, green, blue = red * r, green * g, blue * b_
+        found[i, 9], found[i, 10], found[i, 11] = red, green, blue
+        for k in range(4):
+            found[i, 12 + k] = materials[m, 3 + k]
 
 
 def headlight(directions: F32, sky: Environment, hits: Hits | None, surfaces: Surfaces | None) -> F32:
     """Return what rays see, float32 (n, 3): triangles lit from the viewer, else the sky."""
     seen = np.zeros((len(directions), 3), np.float32)
     if hits is None or surfaces is None:
-        nothing, flat = np.full(len(directions), -1, np.int32), np.zeros(len(directions), np.float32)
-        _headlight(directions, sky_row(sky), nothing, flat, flat, _NO_LOOKS, seen)
+        nothing = np.full(len(directions), -1, np.int32)
+        _headlight(directions, sky_row(sky), nothing, np.zeros((0, 16)), seen)
     else:
-        _headlight(directions, sky_row(sky), hits.primitive, hits.u, hits.v, surfaces.looks, seen)
+        at = surfaces.at(directions, hits.primitive, hits.u, hits.v)
+        _headlight(directions, sky_row(sky), hits.primitive, at, seen)
     return seen
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _headlight(direction, sky, primitive, u, v, looks, seen):  # type: ignore[no-untyped-def]
+def _headlight(direction, sky, primitive, at, seen):  # type: ignore[no-untyped-def]
     for i in range(len(direction)):
         dx, dy, dz = np.float64(direction[i, 0]), np.float64(direction[i, 1]), np.float64(direction[i, 2])
         if primitive[i] < 0:
             for c in range(3):
                 seen[i, c] = sky_color(sky, dx, dy, dz, c)
             continue
-        point = surface_point(primitive[i], np.float64(u[i]), np.float64(v[i]), dx, dy, dz, looks)
-        facing = abs(dx * point[6] + dy * point[7] + dz * point[8])
+        facing = abs(dx * at[i, 6] + dy * at[i, 7] + dz * at[i, 8])
         for c in range(3):
-            seen[i, c] = point[9 + c] * (1.0 - _FACING + _FACING * facing)
+            seen[i, c] = at[i, 9 + c] * (1.0 - _FACING + _FACING * facing)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _shade(  # type: ignore[no-untyped-def]
-    direction, throughput, pixel, sample, kind, diffuse_bounces, mirror_bounces, primitive, u, v,
-    looks, sky, points, light_first, light_rows,
+    direction, throughput, pixel, sample, kind, diffuse_bounces, mirror_bounces, primitive, at,
+    sky, points, light_first, light_rows,
     most_diffuse, most_mirror, roulette, seed,
     radiance, children, out_origin, out_bits, out_direction, out_throughput, out_reach, out_parent, out_kind,
 ):  # fmt: skip
@@ -342,19 +336,17 @@ def _shade(  # type: ignore[no-untyped-def]
                 radiance[i, c] = throughput[i, c] * sky_color(sky, dx, dy, dz, c)
             continue
 
-        px, py, pz, gx, gy, gz, nx, ny, nz, ar, ag, ab = surface_point(
-            primitive[i], np.float64(u[i]), np.float64(v[i]), dx, dy, dz, looks
-        )
+        px, py, pz, gx, gy, gz = at[i, 0], at[i, 1], at[i, 2], at[i, 3], at[i, 4], at[i, 5]
+        nx, ny, nz, ar, ag, ab = at[i, 6], at[i, 7], at[i, 8], at[i, 9], at[i, 10], at[i, 11]
         if gx == 0.0 and gy == 0.0 and gz == 0.0:
             continue  # a degenerate triangle has no side to scatter to
 
-        m = looks.material[primitive[i]]
         if kind[i] != DIFFUSE:  # light that reached a diffuse bounce directly was counted by its shadow ray
             for c in range(3):
-                radiance[i, c] = throughput[i, c] * looks.materials[m, 4 + c]
+                radiance[i, c] = throughput[i, c] * at[i, 13 + c]
 
         key = path_key(seed, pixel[i], sample[i], 1 + diffuse_bounces[i] + mirror_bounces[i])
-        is_mirror = uniform(key, _LOBE) < looks.materials[m, 3]
+        is_mirror = uniform(key, _LOBE) < at[i, 12]
         if (is_mirror and mirror_bounces[i] >= most_mirror) or (not is_mirror and diffuse_bounces[i] >= most_diffuse):
             continue
         tr, tg, tb = throughput[i, 0] * ar, throughput[i, 1] * ag, throughput[i, 2] * ab
@@ -390,17 +382,10 @@ def _shade(  # type: ignore[no-untyped-def]
         mx, my, mz = 0.0, 0.0, 0.0
         for light in range(n_area + n_point):
             dimension = _LIGHTS + 4 * light
-            low = 0
+            low = np.int64(0)
             if light < n_area:
-                low, high = light_first[light], light_first[light + 1] - 1
-                area = light_rows[high, 15]
-                target = uniform(key, dimension) * area
-                while low < high:
-                    middle = (low + high) // 2
-                    if light_rows[middle, 15] <= target:
-                        low = middle + 1
-                    else:
-                        high = middle
+                area = light_rows[light_first[light + 1] - 1, 15]
+                low = light_triangle(light_first, light_rows, light, uniform(key, dimension))
                 s1, s2 = math.sqrt(uniform(key, dimension + 1)), uniform(key, dimension + 2)
                 w1, w2 = s1 * (1.0 - s2), s1 * s2
                 lx = light_rows[low, 0] + w1 * light_rows[low, 3] + w2 * light_rows[low, 6]
@@ -409,13 +394,12 @@ def _shade(  # type: ignore[no-untyped-def]
             else:
                 lx, ly, lz = points[light - n_area, 0], points[light - n_area, 1], points[light - n_area, 2]
             wx, wy, wz = lx - px, ly - py, lz - pz
+            along = wx * nx + wy * ny + wz * nz
+            if along <= 0.0:
+                continue
             squared = wx * wx + wy * wy + wz * wz
-            if squared <= 0.0:
-                continue
             away = math.sqrt(squared)
-            cosine = (wx * nx + wy * ny + wz * nz) / away
-            if cosine <= 0.0:
-                continue
+            cosine = along / away
             if light < n_area:
                 sx, sy, sz = light_rows[low, 9], light_rows[low, 10], light_rows[low, 11]
                 facing = (wx * sx + wy * sy + wz * sz) / away

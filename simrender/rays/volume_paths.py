@@ -20,7 +20,7 @@ from simrender.rays.kinds import SCATTER, SHADOW
 from simrender.rays.marching import gradients
 from simrender.rays.sampling import cosine_direction, offset_origin, path_key, uniform
 from simrender.rays.scene import Scene
-from simrender.rays.shading import sky_color, sky_row, surface_point
+from simrender.rays.shading import sky_color, sky_row
 from simrender.rays.tracking import isotropic_direction
 
 if TYPE_CHECKING:
@@ -109,9 +109,9 @@ def scatter(
     emitted = np.zeros((n, 3))
     if hits is not None and surfaces is not None:
         on = np.flatnonzero(event == _TRIANGLE)
-        _on_triangles(
-            on, rays["direction"], hits.primitive, hits.u, hits.v, surfaces.looks, point, normal, albedo, emitted
-        )
+        primitives = np.where(event == _TRIANGLE, hits.primitive, np.int32(-1))
+        at = surfaces.at(rays["direction"], primitives, hits.u, hits.v)[on]
+        point[on], normal[on], albedo[on], emitted[on] = at[:, :3], at[:, 3:6], at[:, 9:12], at[:, 13:]
 
     points = [(*p.position, *p.intensity, float(p.falloff)) for p in scene.points]
     out: Columns = {
@@ -142,21 +142,6 @@ def scatter(
         "children": children,
         **columns,
     }
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _on_triangles(  # type: ignore[no-untyped-def]
-    rows, direction, primitive, u, v, looks, point, normal, albedo, emitted
-):
-    for i in rows:
-        dx, dy, dz = np.float64(direction[i, 0]), np.float64(direction[i, 1]), np.float64(direction[i, 2])
-        at = surface_point(primitive[i], np.float64(u[i]), np.float64(v[i]), dx, dy, dz, looks)
-        m = looks.material[primitive[i]]
-        point[i, 0], point[i, 1], point[i, 2] = at[0], at[1], at[2]
-        normal[i, 0], normal[i, 1], normal[i, 2] = at[3], at[4], at[5]
-        albedo[i, 0], albedo[i, 1], albedo[i, 2] = at[9], at[10], at[11]
-        for c in range(3):
-            emitted[i, c] = looks.materials[m, 4 + c]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
