@@ -32,6 +32,9 @@ B = TypeVar("B")
 CHUNK = 1 << 14
 """Rays a thread takes at once: small enough to stay in its cache, large enough to hide Python."""
 
+_FEW = 1 << 11
+"""Rays that are not worth a second core."""
+
 _NOTHING = np.float32(1e-17)
 """A component of a direction that is too small to change a hit, and just large enough for Embree to see its sign."""
 
@@ -141,8 +144,12 @@ def on_all_cores(work: Callable[[A], B], items: Iterable[A]) -> list[B]:
 
 
 def chunks(n: int) -> list[slice]:
-    """Cut ``range(n)`` into slices of `CHUNK`."""
-    return [slice(start, min(start + CHUNK, n)) for start in range(0, n, CHUNK)]
+    """Cut ``range(n)`` into slices of about the same size, `CHUNK` at most, as many for each core."""
+    count = -(-n // CHUNK)
+    if n > _FEW:
+        count = -(-count // _cores()) * _cores()
+    size = -(-n // max(1, count))
+    return [slice(start, min(start + size, n)) for start in range(0, n, max(1, size))]
 
 
 @cache
@@ -155,5 +162,9 @@ def _device() -> Any:
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return ThreadPoolExecutor(cores, thread_name_prefix="embree")
+    return ThreadPoolExecutor(_cores(), thread_name_prefix="embree")
+
+
+@cache
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -42,12 +42,12 @@ def shade(
     if most > _MOST:
         raise SceneError(f"{most:,} rays a hit are more than the {_MOST:,} that are counted; use fewer shadow samples")
     out: dict[str, Any] = {
-        "origin": np.zeros((most * n, 3), np.float32),
-        "direction": np.zeros((most * n, 3), np.float32),
-        "throughput": np.zeros((most * n, 3), np.float32),
-        "reach": np.zeros(most * n, np.float32),
-        "parent": np.zeros(most * n, np.int32),
-        "kind": np.zeros(most * n, np.uint8),
+        "origin": np.empty((most * n, 3), np.float32),
+        "direction": np.empty((most * n, 3), np.float32),
+        "throughput": np.empty((most * n, 3), np.float32),
+        "reach": np.empty(most * n, np.float32),
+        "parent": np.empty(most * n, np.int32),
+        "kind": np.empty(most * n, np.uint8),
     }
     radiance, children = np.zeros((n, 3), np.float32), np.zeros(n, np.uint16)
     scattering = np.where(rays["kind"] == SHADOW, np.int32(-1), hits.primitive)

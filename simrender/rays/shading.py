@@ -171,12 +171,12 @@ def shade(rays: dict[str, Any], hits: Any, surfaces: Surfaces, path: PathTracing
     """
     n = len(rays["kind"])
     out: dict[str, Any] = {
-        "origin": np.zeros((2 * n, 3), np.float32),
-        "direction": np.zeros((2 * n, 3), np.float32),
-        "throughput": np.zeros((2 * n, 3), np.float32),
-        "reach": np.zeros(2 * n, np.float32),
-        "parent": np.zeros(2 * n, np.int32),
-        "kind": np.zeros(2 * n, np.uint8),
+        "origin": np.empty((2 * n, 3), np.float32),
+        "direction": np.empty((2 * n, 3), np.float32),
+        "throughput": np.empty((2 * n, 3), np.float32),
+        "reach": np.empty(2 * n, np.float32),
+        "parent": np.empty(2 * n, np.int32),
+        "kind": np.empty(2 * n, np.uint8),
     }
     radiance, children = np.zeros((n, 3), np.float32), np.zeros(n, np.uint16)
     scattering = np.where(rays["kind"] == SHADOW, np.int32(-1), hits.primitive)
