@@ -124,9 +124,12 @@ class Welded:
         self.around = np.argsort(flat, kind="stable") // 3
         self.begin = np.searchsorted(np.sort(flat), np.arange(count + 1))
         self.used = np.flatnonzero(np.diff(self.begin) > 0)
-        ends = np.sort(np.concatenate([self.faces[:, [0, 1]], self.faces[:, [1, 2]], self.faces[:, [2, 0]]]), axis=1)
-        keys, times = np.unique(ends[:, 0].astype(np.int64) * count + ends[:, 1], return_counts=True)
-        open_ = keys[times != 2]
+        # Around a vertex the surface is whole, and its faces look the same way, if each edge is passed once in either
+        # direction. Where they do not, a ray that seems to go through the surface may pass by its outline.
+        begins, ends = (np.roll(self.faces, -k, axis=1).ravel().astype(np.int64) for k in (0, 1))
+        there, counts = np.unique(begins * count + ends, return_counts=True)
+        single = there[counts == 1]
+        open_ = there[(counts != 1) | ~np.isin(there % count * count + there // count, single)]
         closed = np.ones(count, np.bool_)
         closed[np.concatenate([open_ // count, open_ % count])] = False
         self.inner = np.flatnonzero(closed & (np.diff(self.begin) > 0))

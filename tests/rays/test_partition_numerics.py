@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 
 from simrender import load_workload
-from simrender.accuracy.partitions import CUTS, aimed_rays, bundle, compare, nearest, partitions, path_rays, random_rays
+from simrender.accuracy.partitions import (
+    CUTS,
+    Welded,
+    aimed_rays,
+    bundle,
+    compare,
+    nearest,
+    partitions,
+    path_rays,
+    random_rays,
+)
 from simrender.accuracy.stability import escapes
 from simrender.errors import SceneError
 from simrender.rays import embree
@@ -68,8 +78,8 @@ def test_watertight_no_ray_at_a_vertex_an_edge_or_a_face_leaks_between_domains(t
 
 def test_watertight_rays_through_a_surface_at_its_vertices_hit_it(table):
     rows = [row for row in table if row["aim"] in AIMED[2:]]
-    # A handful of a hundred thousand slips past a vertex, and does so however the scene is cut.
-    assert total(rows, "rays") - total(rows, "hits") <= 1e-4 * total(rows, "rays")
+    # One of a hundred thousand may slip past a vertex, and does so however the scene is cut.
+    assert total(rows, "rays") - total(rows, "hits") <= 1e-5 * total(rows, "rays")
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -161,6 +171,14 @@ def test_aimed_rays_pass_through_what_they_are_aimed_at():
         assert gap.max() < 1e-5
     assert (np.sort(np.abs(aims["axis-parallel"]["direction"]), axis=1) == [0.0, 0.0, 1.0]).all()
     assert (aims["faces"]["direction"] == 0.0).any(axis=1).all()
+
+
+def test_rays_go_through_a_surface_only_where_its_faces_look_the_same_way():
+    """Of a square pyramid whose sides look outwards and whose base, turned over, looks inwards: through its tip."""
+    corners = np.float32([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0], [1, 1, 1]])
+    sides = [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]
+    for base, vertices in (([[0, 3, 2], [0, 2, 1]], 5), ([[0, 2, 3], [0, 1, 2]], 1)):
+        assert len(Welded(one(Mesh(corners, np.int32(sides + base)))).inner) == vertices
 
 
 def test_the_rays_of_a_frame_are_those_of_the_camera_and_all_that_they_spawn(tmp_path):

@@ -126,6 +126,8 @@ def test_what_is_assumed_about_the_museum_agrees_with_figure_7():
 def test_the_hall_is_closed(hall):
     shell = next(thing for thing in hall.objects if thing.name == "hall")
     assert (uses_of_edges(of_object(shell)) == 2).all()
+    section = 2 * 12.5 * 8.2 + 0.5 * np.pi * 6.5**2
+    assert volume(of_object(shell)) == pytest.approx(54.0 * section, rel=2e-3)  # all faces look outwards
     walls = of_object(shell)[0]
     low, high = hall.bounds  # there are outer walls too
     assert (low < walls.min(axis=0)).all()

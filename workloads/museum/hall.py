@@ -123,8 +123,8 @@ def _shell() -> SceneObject:
     faces = grid_faces(n, rows - 1) % (n * rows)  # the outline is closed
     first = np.arange(n) * rows
     after = np.roll(first, -1)
-    near = np.stack([after, first, np.full(n, n * rows)], axis=1)
-    far = np.stack([first + rows - 1, after + rows - 1, np.full(n, n * rows + 1)], axis=1)
+    near = np.stack([first, after, np.full(n, n * rows)], axis=1)
+    far = np.stack([after + rows - 1, first + rows - 1, np.full(n, n * rows + 1)], axis=1)
     material = np.concatenate([_cladding(outline, kind, y), np.full(2 * n, INDEX["plaster"])])
     faces = np.concatenate([faces, near, far])
     kinds = np.flatnonzero(np.bincount(material))
