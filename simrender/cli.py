@@ -782,6 +782,7 @@ class _Progress:
             if console.is_terminal:
                 self._bar.start()
             self._task = self._bar.add_task("")
+        if generation == done == 0:  # told once more when hierarchies and kernels are made
             self._begin = time.perf_counter()
         self.seconds = time.perf_counter() - self._begin
         self._bar.update(

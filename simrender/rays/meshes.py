@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import re
+import warnings
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from simrender.errors import SceneError
+from simrender.errors import SceneError, SceneWarning, did_you_mean
 from simrender.rays.scene import GAMMA, IDENTITY, Environment, Material, Mesh, PointLight, Scene, SceneObject, Texture
 
 FORMATS = (".ply", ".obj", ".glb", ".gltf", ".stl")
@@ -19,6 +22,8 @@ _PARTS = 64
 """A scanned mesh has no objects to deal to GPUs, so it is cut into this many meshes, in the order of its faces."""
 
 _DAMAGED = "cannot read this mesh, which is damaged or cut short"
+
+_IMAGES = (".png", ".jpg", ".jpeg", ".tga", ".bmp", ".tif", ".tiff", ".webp")
 
 _Y_UP = (".obj", ".glb", ".gltf")
 
@@ -32,13 +37,19 @@ def read_scene(path: Path) -> Scene:
         A file of one of the `FORMATS`. A file with a scene graph keeps its instances; single meshes are cut into parts
         that a partition can deal out. Materials keep their color and the image that it is multiplied by.
 
+    Warns
+    -----
+    SceneWarning
+        If an image that the file names is not there: the surface is then in its color alone.
+
     Raises
     ------
     SceneError
-        If the file is missing, unreadable, or holds a mesh that cannot be rendered; the message names the file.
+        If the file or an image is unreadable, or it holds a mesh that cannot be rendered; the message names the file.
 
     """
     loaded = _loaded(path)
+    _check_images(path)
     import trimesh
 
     try:
@@ -113,6 +124,48 @@ def _from_mesh(loaded: Any, path: Path) -> Scene:
     thing = SceneObject(path.stem, _cut(replace(mesh, uv=uv), _PARTS))
     y_up = path.suffix.lower() in _Y_UP
     return _lit((thing,), np.zeros(1, np.int32), IDENTITY[None], (material,), textures, y_up)
+
+
+def _check_images(path: Path) -> None:
+    """Warn of images that a file names and that are not there, and refuse damaged ones: trimesh does without either."""
+    from PIL import Image
+
+    for where, name in _named_images(path):
+        file = path.parent / name
+        if not file.is_file():
+            near = did_you_mean(name, [beside.name for beside in path.parent.iterdir() if beside.suffix in _IMAGES])
+            message = f"{where}: there is no image {name!r} in {path.parent}, and the surface has its color alone{near}"
+            warnings.warn(message, SceneWarning, stacklevel=4)
+            continue
+        try:
+            with Image.open(file) as image:
+                image.load()
+        except (OSError, SyntaxError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            raise SceneError(
+                f"{where}: cannot read the image {file}, which is damaged or cut short: {reason}"
+            ) from None
+
+
+def _named_images(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield where an OBJ or glTF file names an image of its own folder, and its name."""
+    if path.suffix.lower() == ".gltf":
+        for number, image in enumerate(json.loads(path.read_bytes()).get("images", [])):
+            name = image.get("uri", "data:")
+            if not name.startswith("data:"):
+                yield f"{path}: image {number}", name
+    elif path.suffix.lower() == ".obj":
+        for library in _named(path, "mtllib"):
+            file = path.parent / library[1]
+            for line, name in _named(file, "map_kd") if file.is_file() else ():
+                yield f"{file}:{line}", name
+
+
+def _named(file: Path, key: str) -> list[tuple[int, str]]:
+    """Return the lines of a text file that begin with a key word, and what follows it."""
+    with file.open(encoding="utf-8", errors="replace") as lines:
+        words = ((at, line.strip().split(None, 1)) for at, line in enumerate(lines, 1))
+        return [(at, pair[1]) for at, pair in words if len(pair) == 2 and pair[0].lower() == key]
 
 
 def _check_length(elements: Any) -> None:
@@ -259,7 +312,10 @@ def _material(geometry: Any, textures: list[Texture]) -> tuple[Material, Any]:
             return Material((0.72, 0.68, 0.62)), None
         red, green, blue = (float(c) / 255.0 for c in color[:3])
         return Material((red**GAMMA, green**GAMMA, blue**GAMMA)), None
-    textures.append(Texture(np.asarray(image.convert("RGB"))))
+    try:
+        textures.append(Texture(np.asarray(image.convert("RGB"))))
+    except (OSError, SyntaxError, ValueError) as error:  # read only now
+        raise SceneError(f"an image in it is damaged or cut short: {error}") from None
     factor = getattr(material, "baseColorFactor", None)
     red, green, blue = (1.0, 1.0, 1.0) if factor is None else (float(c) / 255.0 for c in factor[:3])
     return Material((red, green, blue), texture=len(textures) - 1), np.asarray(uv)

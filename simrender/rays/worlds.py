@@ -163,6 +163,8 @@ class SurfaceWorld:
             return {name: made[name] if made[name].base is None else made[name].copy() for name in SPAWNED}
 
         parts = [work(slice(0, 0))]  # loads the kernels, or compiles them the first time
+        if done:
+            done(0)  # what there is to be timed begins here
         parts += embree.in_chunks(work, n, done)
         return own | joined(parts)
 

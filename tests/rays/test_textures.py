@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import json
+import re
+
 import numpy as np
 import pytest
 
 from simrender import load_workload
-from simrender.errors import SceneError
+from simrender.errors import SceneError, SceneWarning
 from simrender.rays.integrators import RayCasting
 from simrender.rays.meshes import read_scene
 from simrender.rays.scene import GAMMA, IDENTITY, Environment, Material, Mesh, Scene, SceneObject, Texture, texture
@@ -94,6 +97,51 @@ def test_a_mesh_file_keeps_its_image(ending, tmp_path):
     assert lit[0, 3] == pytest.approx([0.0, green, 0.0], abs=2e-3)
     assert lit[2, 1] == pytest.approx([0.0, 0.0, 1.0], abs=2e-3)
     assert load_workload(str(path), cache=tmp_path).published.texture_bytes == TEXELS.nbytes
+
+
+OBJ = "mtllib square.mtl\nusemtl m\nv 0 0 0\nv 1 0 0\nv 1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nf 1/1 2/2 3/3\n"
+
+
+def test_an_image_that_is_not_there_is_warned_of_and_the_color_stays(tmp_path):
+    path = tmp_path / "square.obj"
+    path.write_text(OBJ)
+    (tmp_path / "square.mtl").write_text("newmtl m\nKd 1 0 0\nmap_Kd bricks.png\n")
+    (tmp_path / "brick.png").write_bytes(b"")
+    message = f"{tmp_path / 'square.mtl'}:3: there is no image 'bricks.png' in {tmp_path}, and the surface has its "
+    with pytest.warns(SceneWarning, match=re.escape(message + "color alone; did you mean 'brick.png'?")):
+        scene = read_scene(path)
+    assert (scene.textures, scene.materials[0].albedo) == ((), (1.0, 0.0, 0.0))
+
+
+def test_an_image_that_gltf_names_is_looked_for_too(tmp_path):
+    import trimesh
+    from PIL import Image
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    visual = TextureVisuals(uv=CORNERS[:, :2], material=PBRMaterial(baseColorTexture=Image.fromarray(TEXELS)))
+    made = trimesh.Trimesh(CORNERS, SQUARE, visual=visual, process=False)
+    for name, data in trimesh.Scene(made).export(file_type="gltf").items():
+        (tmp_path / name).write_bytes(data)
+    path = tmp_path / "model.gltf"
+    card = json.loads(path.read_bytes())
+    path.write_text(json.dumps(card | {"images": [{"uri": "bricks.png"}]}))
+    with pytest.warns(SceneWarning, match="model.gltf: image 0: there is no image 'bricks.png'"):
+        assert read_scene(path).textures == ()
+    Image.fromarray(TEXELS).save(tmp_path / "bricks.png")
+    assert [image.texels.tolist() for image in read_scene(path).textures] == [TEXELS.tolist()]
+
+
+def test_a_damaged_image_is_refused(tmp_path):
+    path, image = tmp_path / "square.obj", tmp_path / "bricks.png"
+    path.write_text(OBJ)
+    (tmp_path / "square.mtl").write_text("newmtl m\nmap_Kd bricks.png\n")
+    for damage in (b"", b"no image at all"):
+        image.write_bytes(damage)
+        with pytest.raises(
+            SceneError, match=re.escape(f"square.mtl:2: cannot read the image {image}, which is damaged")
+        ):
+            read_scene(path)
 
 
 def test_what_is_no_texture_is_refused():
