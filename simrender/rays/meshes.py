@@ -109,10 +109,14 @@ def _one_mesh(loaded: Any) -> Mesh:
     faces = getattr(loaded, "faces", None)
     if faces is None or len(faces) == 0:
         raise SceneError("the mesh is empty: it has no triangles")
-    colors = None
-    if loaded.visual.kind == "vertex":
-        colors = np.asarray(loaded.visual.vertex_colors)[:, :3].astype(np.float32) / np.float32(255.0)
-    return Mesh(np.asarray(loaded.vertices), np.asarray(faces), colors=colors)
+    return Mesh(np.asarray(loaded.vertices), np.asarray(faces), colors=_colors(loaded))
+
+
+def _colors(geometry: Any) -> Any:
+    """Return the colors of a geometry's vertices, 0 to 1, as they are in its file; None if it has none."""
+    if geometry.visual.kind != "vertex":
+        return None
+    return np.asarray(geometry.visual.vertex_colors)[:, :3].astype(np.float32) / np.float32(255.0)
 
 
 def _from_mesh(loaded: Any, path: Path) -> Scene:
@@ -271,7 +275,9 @@ def _from_graph(graph: Any) -> Scene:
             continue  # points and lines reflect nothing
         index[name] = len(objects)
         material, uv = _material(geometry, textures)
-        mesh = Mesh(np.asarray(geometry.vertices), np.asarray(geometry.faces), len(materials), uv=uv)
+        # Unlike those of other files, the colors of glTF are reflectances.
+        colors = _colors(geometry)
+        mesh = Mesh(np.asarray(geometry.vertices), np.asarray(geometry.faces), len(materials), colors, uv=uv)
         objects.append(SceneObject(str(name), _cut(mesh, -(-len(mesh.faces) * _PARTS // total))))
         materials.append(material)
     owner, transforms = [], []

@@ -113,6 +113,16 @@ def test_an_image_that_is_not_there_is_warned_of_and_the_color_stays(tmp_path):
     assert (scene.textures, scene.materials[0].albedo) == ((), (1.0, 0.0, 0.0))
 
 
+def test_the_vertices_of_a_glb_file_keep_their_colors(tmp_path):
+    import trimesh
+
+    made = trimesh.Trimesh(CORNERS, SQUARE, vertex_colors=[[255, 51, 0, 255]] * 4, process=False)
+    (tmp_path / "square.glb").write_bytes(trimesh.Scene(made).export(file_type="glb"))
+    (thing,) = read_scene(tmp_path / "square.glb").objects
+    for mesh in thing.meshes:
+        assert mesh.colors == pytest.approx(np.tile([1.0, 0.2, 0.0], (len(mesh.vertices), 1)))
+
+
 def test_an_image_that_gltf_names_is_looked_for_too(tmp_path):
     import trimesh
     from PIL import Image
