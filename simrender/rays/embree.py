@@ -101,9 +101,10 @@ class Geometry:
 
     def _ask_again(self, found: Hits, origins: F32, directions: F32, reach: F32) -> None:
         """Let rays within axis planes meet what they meet with the other sign of 0, where that is nearer."""
-        flat = directions == 0.0
+        rows = np.unique(np.nonzero(directions == 0.0)[0])
+        flat = directions[rows] == 0.0
         for signs in list(product((False, True), repeat=3))[1:]:
-            bent = np.flatnonzero((flat | ~np.array(signs)).all(axis=1))
+            bent = rows[(flat | ~np.array(signs)).all(axis=1)]
             if len(bent) == 0:
                 continue
             direction = np.where(signs, -_NOTHING, directions[bent])
