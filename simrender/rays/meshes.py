@@ -123,7 +123,7 @@ def _from_mesh(loaded: Any, path: Path) -> Scene:
     mesh = _one_mesh(loaded)
     if mesh.colors is not None:
         mesh = replace(mesh, colors=mesh.colors ** np.float32(GAMMA))
-    textures: list[Texture] = []
+    textures: dict[int, Texture] = {}
     material, uv = _material(loaded, textures)
     thing = SceneObject(path.stem, _cut(replace(mesh, uv=uv), _PARTS))
     y_up = path.suffix.lower() in _Y_UP
@@ -267,7 +267,7 @@ def _from_graph(graph: Any) -> Scene:
         raise SceneError("nothing could be read: it is empty, cut short, or in another format than its ending says")
     objects: list[SceneObject] = []
     materials: list[Material] = []
-    textures: list[Texture] = []
+    textures: dict[int, Texture] = {}
     index: dict[str, int] = {}
     total = max(1, sum(len(getattr(geometry, "faces", ())) for geometry in graph.geometry.values()))
     for name, geometry in graph.geometry.items():
@@ -304,11 +304,11 @@ def _part(mesh: Mesh, faces: Any) -> Mesh:
     return replace(mesh, vertices=mesh.vertices[used], faces=corners, colors=colors, uv=uv)
 
 
-def _material(geometry: Any, textures: list[Texture]) -> tuple[Material, Any]:
-    """Return a geometry's material and its texture coordinates, None for none; its image is added to the textures.
+def _material(geometry: Any, textures: dict[int, Texture]) -> tuple[Material, Any]:
+    """Return a geometry's material and its texture coordinates, None for none.
 
-    The base color of glTF is a reflectance, by which its image is multiplied; OBJ's is meant for a display, and an
-    image takes its place.
+    Its image is added to the textures, of which there is one for each image, by its identity. The base color of glTF is a
+    reflectance, by which its image is multiplied; OBJ's is meant for a display, and an image takes its place.
     """
     material, uv = getattr(geometry.visual, "material", None), getattr(geometry.visual, "uv", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
@@ -319,17 +319,18 @@ def _material(geometry: Any, textures: list[Texture]) -> tuple[Material, Any]:
         red, green, blue = (float(c) / 255.0 for c in color[:3])
         return Material((red**GAMMA, green**GAMMA, blue**GAMMA)), None
     try:
-        textures.append(Texture(np.asarray(image.convert("RGB"))))
+        if id(image) not in textures:
+            textures[id(image)] = Texture(np.asarray(image.convert("RGB")))
     except (OSError, SyntaxError, ValueError) as error:  # read only now
         raise SceneError(f"an image in it is damaged or cut short: {error}") from None
     factor = getattr(material, "baseColorFactor", None)
     red, green, blue = (1.0, 1.0, 1.0) if factor is None else (float(c) / 255.0 for c in factor[:3])
-    return Material((red, green, blue), texture=len(textures) - 1), np.asarray(uv)
+    return Material((red, green, blue), texture=list(textures).index(id(image))), np.asarray(uv)
 
 
-def _lit(objects: Any, owner: Any, transforms: Any, materials: Any, textures: list[Texture], y_up: bool) -> Scene:
+def _lit(objects: Any, owner: Any, transforms: Any, materials: Any, textures: dict[int, Texture], y_up: bool) -> Scene:
     """Add a sky, and a lamp above and beside the scene that gives its centre an irradiance of about 2."""
-    scene = Scene(objects, owner, transforms, materials, textures=tuple(textures))
+    scene = Scene(objects, owner, transforms, materials, textures=tuple(textures.values()))
     low, high = (corner.astype(np.float64) for corner in scene.bounds)
     if (low == high).all():
         raise SceneError(f"the mesh has no extent: all its vertices lie at {low.tolist()}")

@@ -113,6 +113,22 @@ def test_an_image_that_is_not_there_is_warned_of_and_the_color_stays(tmp_path):
     assert (scene.textures, scene.materials[0].albedo) == ((), (1.0, 0.0, 0.0))
 
 
+def test_an_image_of_several_surfaces_is_one_texture(tmp_path):
+    import trimesh
+    from PIL import Image
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    material, scene = PBRMaterial(baseColorTexture=Image.fromarray(TEXELS)), trimesh.Scene()
+    for name in ("one", "two"):
+        visual = TextureVisuals(uv=CORNERS[:, :2], material=material)
+        scene.add_geometry(trimesh.Trimesh(CORNERS, SQUARE, visual=visual, process=False), geom_name=name)
+    (tmp_path / "two.glb").write_bytes(scene.export(file_type="glb"))
+    found = read_scene(tmp_path / "two.glb")
+    assert (len(found.objects), len(found.textures)) == (2, 1)
+    assert [material.texture for material in found.materials] == [0, 0]
+
+
 def test_the_vertices_of_a_glb_file_keep_their_colors(tmp_path):
     import trimesh
 
