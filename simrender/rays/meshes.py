@@ -307,8 +307,8 @@ def _part(mesh: Mesh, faces: Any) -> Mesh:
 def _material(geometry: Any, textures: dict[int, Texture]) -> tuple[Material, Any]:
     """Return a geometry's material and its texture coordinates, None for none.
 
-    Its image is added to the textures, of which there is one for each image, by its identity. The base color of glTF is a
-    reflectance, by which its image is multiplied; OBJ's is meant for a display, and an image takes its place.
+    Its image is added to the textures, of which there is one for each image, by its identity. The base color of glTF
+    is a reflectance, by which its image is multiplied; OBJ's is meant for a display, and an image takes its place.
     """
     material, uv = getattr(geometry.visual, "material", None), getattr(geometry.visual, "uv", None)
     image = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
