@@ -17,7 +17,7 @@ from simrender.errors import SceneError
 from simrender.rays.integrators import AmbientOcclusion, SprayPathTracing
 from simrender.rays.kinds import DIFFUSE, SHADOW
 from simrender.rays.sampling import cosine_direction, offset_origin, path_key, uniform
-from simrender.rays.shading import Surfaces, light_triangle
+from simrender.rays.shading import Surfaces, light_triangle, scattering
 
 # Dimensions of the random numbers at a surface: two for the diffuse ray, then four a shadow ray.
 _DIRECTION, _SHADOWS = 0, 2
@@ -50,8 +50,7 @@ def shade(
         "kind": np.empty(most * n, np.uint8),
     }
     radiance, children = np.zeros((n, 3), np.float32), np.zeros(n, np.uint16)
-    scattering = np.where(rays["kind"] == SHADOW, np.int32(-1), hits.primitive)
-    at = surfaces.at(rays["direction"], scattering, hits.u, hits.v)
+    at = surfaces.at(rays["direction"], scattering(rays, hits), hits.u, hits.v)
     spawned = _light(
         rays["direction"], rays["throughput"], rays["pixel"], rays["sample"], rays["kind"],
         rays["diffuse"], hits.primitive, at,

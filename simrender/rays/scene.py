@@ -367,25 +367,25 @@ class Scene:
 
         The array has no rows if no mesh has colors.
         """
-        if all(mesh.colors is None for mesh in self.meshes):
-            return np.zeros((0, 3), np.float32)
-        of_object = [
-            np.concatenate([np.full_like(m.vertices, -1.0) if m.colors is None else m.colors for m in thing.meshes])
-            for thing in self.objects
-        ]
-        return np.concatenate([of_object[index] for index in self.instance_object])
+        return self._of_vertices("colors", 3, -1.0)
 
     def vertex_uv(self) -> F32:
         """Return the texture coordinates of each vertex of `triangles`, float32 (v, 2); 0 where the mesh has none.
 
         The array has no rows if no mesh has such.
         """
-        if all(mesh.uv is None for mesh in self.meshes):
-            return np.zeros((0, 2), np.float32)
-        of_object = [
-            np.concatenate([np.zeros((len(m.vertices), 2), np.float32) if m.uv is None else m.uv for m in thing.meshes])
-            for thing in self.objects
-        ]
+        return self._of_vertices("uv", 2, 0.0)
+
+    def _of_vertices(self, name: str, width: int, missing: float) -> F32:
+        """Return an optional column of the meshes for each vertex of `triangles`; no rows if no mesh has it."""
+        if all(getattr(mesh, name) is None for mesh in self.meshes):
+            return np.zeros((0, width), np.float32)
+
+        def column(mesh: Mesh) -> F32:
+            own: F32 | None = getattr(mesh, name)
+            return np.full((len(mesh.vertices), width), missing, np.float32) if own is None else own
+
+        of_object = [np.concatenate([column(mesh) for mesh in thing.meshes]) for thing in self.objects]
         return np.concatenate([of_object[index] for index in self.instance_object])
 
     @cached_property

@@ -107,6 +107,11 @@ class Surfaces:
         return found
 
 
+def scattering(rays: dict[str, Any], hits: Hits) -> NDArray[np.int32]:
+    """Return what rays hit, -1 for those of which it only matters whether they do."""
+    return np.where(rays["kind"] == SHADOW, np.int32(-1), hits.primitive)
+
+
 def sky_row(sky: Environment) -> NDArray[np.float64]:
     """Return an environment as kernels take it, float64 (12,)."""
     return np.array([*sky.zenith, *sky.horizon, *sky.ground, *sky.up], dtype=np.float64)
@@ -179,8 +184,7 @@ def shade(rays: dict[str, Any], hits: Any, surfaces: Surfaces, path: PathTracing
         "kind": np.empty(2 * n, np.uint8),
     }
     radiance, children = np.zeros((n, 3), np.float32), np.zeros(n, np.uint16)
-    scattering = np.where(rays["kind"] == SHADOW, np.int32(-1), hits.primitive)
-    at = surfaces.at(rays["direction"], scattering, hits.u, hits.v)
+    at = surfaces.at(rays["direction"], scattering(rays, hits), hits.u, hits.v)
     spawned = _shade(
         rays["direction"], rays["throughput"], rays["pixel"], rays["sample"], rays["kind"], rays["diffuse"],
         rays["mirror"], hits.primitive, at, surfaces.sky, surfaces.points, surfaces.light_first, surfaces.light_rows,

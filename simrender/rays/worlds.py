@@ -248,8 +248,7 @@ class _Backdrop:
             return geometry.nearest(rays["origin"][rows], rays["direction"][rows], rays["reach"][rows])
 
         parts = [work(slice(0, 0)), *embree.in_chunks(work, len(rays["reach"]))]
-        columns = ([getattr(p, name) for p in parts] for name in ("t", "primitive", "u", "v"))
-        return embree.Hits(*(np.concatenate(column) for column in columns))
+        return embree.Hits(*map(np.concatenate, zip(*(part.columns for part in parts), strict=True)))
 
     def in_front(self, rays: Columns) -> Columns:
         """Return rays that end at the triangles behind the medium, as far as all ranks know them."""
