@@ -167,9 +167,9 @@ def _named_images(path: Path) -> Iterator[tuple[str, str]]:
 
 def _named(file: Path, key: str) -> list[tuple[int, str]]:
     """Return the lines of a text file that begin with a key word, and what follows it."""
-    with file.open(encoding="utf-8", errors="replace") as lines:
-        words = ((at, line.strip().split(None, 1)) for at, line in enumerate(lines, 1))
-        return [(at, pair[1]) for at, pair in words if len(pair) == 2 and pair[0].lower() == key]
+    text = file.read_bytes()
+    found = re.finditer(rb"^[ \t]*" + key.encode() + rb"[ \t]+([^\r\n]*\S)", text, re.MULTILINE | re.IGNORECASE)
+    return [(text.count(b"\n", 0, line.start()) + 1, line[1].decode("utf-8", "replace")) for line in found]
 
 
 def _check_length(elements: Any) -> None:

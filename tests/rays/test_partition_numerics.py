@@ -29,8 +29,10 @@ from tests.scenes import check_nearest, garden_workload, sphere
 
 SMALL = {
     "island": "detail=0.1",
+    "island-xl": "detail=0.05",
     "landscape": "detail=0.1",
     "rm": "points=40",
+    "rm-isosurface": "points=60",
     "enzo": "points=40",
     "boeing": "detail=0.03",
     "museum": "detail=0.03",

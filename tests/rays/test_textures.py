@@ -7,6 +7,7 @@ import re
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from simrender import load_workload
 from simrender.errors import SceneError, SceneWarning
@@ -71,11 +72,16 @@ def test_reflectances_come_back_within_half_a_step_of_a_byte():
     assert np.abs(back - tone).max() < 0.5 * GAMMA / 255.0 + 1e-12
 
 
+def painted(material):
+    """The square as trimesh has it."""
+    import trimesh
+
+    visual = trimesh.visual.TextureVisuals(uv=CORNERS[:, :2], material=material)
+    return trimesh.Trimesh(CORNERS, SQUARE, visual=visual, process=False)
+
+
 @pytest.mark.parametrize("ending", ["glb", "obj"])
 def test_a_mesh_file_keeps_its_image(ending, tmp_path):
-    import trimesh
-    from PIL import Image
-    from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial, SimpleMaterial
 
     image = Image.fromarray(TEXELS)
@@ -83,10 +89,8 @@ def test_a_mesh_file_keeps_its_image(ending, tmp_path):
         material = PBRMaterial(baseColorTexture=image, baseColorFactor=[255, 51, 255, 255])
     else:
         material = SimpleMaterial(image=image, diffuse=[10, 20, 30, 255])
-    visual = TextureVisuals(uv=CORNERS[:, :2], material=material)
-    made = trimesh.Trimesh(CORNERS, SQUARE, visual=visual, process=False)
     path = tmp_path / f"square.{ending}"
-    made.export(path)
+    painted(material).export(path)
     scene = read_scene(path)
     assert [image.texels.tolist() for image in scene.textures] == [TEXELS.tolist()]
     assert {scene.materials[mesh.material].texture for mesh in scene.meshes} == {0}
@@ -115,14 +119,11 @@ def test_an_image_that_is_not_there_is_warned_of_and_the_color_stays(tmp_path):
 
 def test_an_image_of_several_surfaces_is_one_texture(tmp_path):
     import trimesh
-    from PIL import Image
-    from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
     material, scene = PBRMaterial(baseColorTexture=Image.fromarray(TEXELS)), trimesh.Scene()
     for name in ("one", "two"):
-        visual = TextureVisuals(uv=CORNERS[:, :2], material=material)
-        scene.add_geometry(trimesh.Trimesh(CORNERS, SQUARE, visual=visual, process=False), geom_name=name)
+        scene.add_geometry(painted(material), geom_name=name)
     (tmp_path / "two.glb").write_bytes(scene.export(file_type="glb"))
     found = read_scene(tmp_path / "two.glb")
     assert (len(found.objects), len(found.textures)) == (2, 1)
@@ -141,12 +142,9 @@ def test_the_vertices_of_a_glb_file_keep_their_colors(tmp_path):
 
 def test_an_image_that_gltf_names_is_looked_for_too(tmp_path):
     import trimesh
-    from PIL import Image
-    from trimesh.visual import TextureVisuals
     from trimesh.visual.material import PBRMaterial
 
-    visual = TextureVisuals(uv=CORNERS[:, :2], material=PBRMaterial(baseColorTexture=Image.fromarray(TEXELS)))
-    made = trimesh.Trimesh(CORNERS, SQUARE, visual=visual, process=False)
+    made = painted(PBRMaterial(baseColorTexture=Image.fromarray(TEXELS)))
     for name, data in trimesh.Scene(made).export(file_type="gltf").items():
         (tmp_path / name).write_bytes(data)
     path = tmp_path / "model.gltf"
